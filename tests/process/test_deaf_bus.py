@@ -1,128 +1,168 @@
-"""A session of Zenoh that sends and is kept alive, but receives nothing: how one comes about, and what replaces it.
+"""A session of Zenoh that sends and is kept alive, but receives nothing, is replaced by another one.
 
-Zenoh gives up the opening of a session after a time limit, also when half of it is done. Here the limit is so short
-that this happens to some of several sessions which are connected again at once.
+How such a session comes about is shown by `tools/deaf_sessions.py`. Here its ears are taken away.
 """
 
 from __future__ import annotations
 
-import tempfile
-import threading
+import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 import swarmctl.bus.zenoh_bus as zenoh_bus
-from swarmctl.bus.topics import COMMAND, STATUS
-from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
+from swarmctl.bus.network.identities import make_identities
+from swarmctl.bus.network.identity_files import STATION
+from swarmctl.bus.network.joining import join_bus
+from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
+from swarmctl.bus.peers import Bus
+from swarmctl.bus.topics import COMMAND, PATH, STATUS
+from swarmctl.bus.zenoh_bus import ZenohBus
 from swarmctl.errors import StartError
+from tests.benches.free_ports import free_ports
+from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
 from tests.process.test_bus import end, start_router
 
 pytestmark = pytest.mark.process
 
-LISTENERS = 8
-NEVER_S = 1e9
-MOST_RESTARTS = 10
+ROUTER_GIVES_UP_MS = 10_000  # accept_timeout of Zenoh
 
 
-class Scene:
-    """A router that can be restarted, one who speaks, and listeners who speak too."""
-
-    def __init__(self, deaf_s: float) -> None:
-        self.endpoint = f"{SCHEME}{tempfile.mkdtemp(prefix='swarm-test-')}/bus.sock"
-        self.router = start_router(self.endpoint)
-        self.names = [f"agent-{number}" for number in range(1, 1 + LISTENERS)]
-        self.talker = ZenohBus(self.endpoint, "run", "agent-0", {COMMAND: self.names})
-        self.deaf_s = deaf_s
-        self.listeners: list[ZenohBus] = []
-
-    def listen(self) -> None:
-        for name in self.names:
-            self.listeners.append(self._opened(name))
-
-    def _opened(self, name: str) -> ZenohBus:
-        while True:
-            try:
-                return ZenohBus(self.endpoint, "run", name, {STATUS: ["agent-0"]}, deaf_s=self.deaf_s)
-            except StartError:  # the limit was too short for this one
-                continue
-
-    def restart_router(self) -> None:
-        self.router.kill()
-        self.router.wait()
-        assert self.router.stdout is not None
-        self.router.stdout.close()
-        self.router = start_router(self.endpoint)
-
-    def until(self, condition: Callable[[], bool], seconds: float) -> bool:
-        """Have everybody speak and listen until a condition is true."""
-        until_s = time.monotonic() + seconds
-        while not condition() and time.monotonic() < until_s:
-            self.talker.publish(STATUS, b"status")
-            for name, bus in zip(self.names, self.listeners, strict=True):
-                bus.publish(COMMAND, b"command")
-                if bus.receive(STATUS):
-                    self.hearing.add(name)
-            self.heard |= {sender for sender, _ in self.talker.receive(COMMAND)}
-            time.sleep(0.02)
-        return condition()
-
-    def all_hear(self, seconds: float) -> bool:
-        """Return whether all listeners come to hear, while all are heard."""
-        self.hearing, self.heard = set[str](), set[str]()
-        return self.until(lambda: len(self.hearing) == len(self.heard) == LISTENERS, seconds)
+@pytest.fixture(scope="module")
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("bus")
+    folder.chmod(0o700)
+    endpoint = f"{zenoh_bus.SCHEME}{folder}/bus.sock"
+    router = start_router(endpoint)
+    yield endpoint
+    end(router)
 
 
 @contextmanager
-def scene(deaf_s: float) -> Iterator[Scene]:
-    opened = Scene(deaf_s)
+def pair(endpoint: str, deaf_s: float) -> Iterator[tuple[ZenohBus, ZenohBus]]:
+    """Join a listener and a talker, who hear each other."""
+    listener = ZenohBus(endpoint, "run", "agent-0", {STATUS: ["agent-1"], PATH: ["agent-1"]}, deaf_s=deaf_s)
+    talker = ZenohBus(endpoint, "run", "agent-1", {COMMAND: ["agent-0"]})
     try:
-        yield opened
+        assert hears(listener, talker, 10.0)
+        yield listener, talker
     finally:
-        closing = [threading.Thread(target=bus.close) for bus in (opened.talker, *opened.listeners)]
-        for thread in closing:  # what is deaf closes slowly
-            thread.start()
-        for thread in closing:
-            thread.join()
-        end(opened.router)
+        listener.close()
+        talker.close()
 
 
-def test_sessions_that_went_deaf_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    with scene(deaf_s=1.0) as flight:
-        with monkeypatch.context() as short:
-            short.setattr(zenoh_bus, "_CLIENT_OPEN_TIMEOUT_MS", 1)
-            flight.listen()
-        assert flight.all_hear(10.0)
-        for _ in range(MOST_RESTARTS):
-            flight.restart_router()
-            assert flight.all_hear(15.0)
-            if any(bus.reopened() for bus in flight.listeners):
-                break
-        assert any(bus.reopened() for bus in flight.listeners)
-        for bus in flight.listeners:
-            assert flight.until(lambda bus=bus: bus.alive() == {"agent-0", *flight.names}, 5.0)  # type: ignore[misc]
+def hears(listener: Bus, talker: Bus, seconds: float) -> bool:
+    until_s = time.monotonic() + seconds
+    while time.monotonic() < until_s:
+        talker.publish(STATUS, b"status")
+        time.sleep(0.02)
+        if listener.receive(STATUS):
+            return True
+    return False
 
 
-def test_control_they_stay_deaf_if_nobody_replaces_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    with scene(deaf_s=NEVER_S) as flight:
-        with monkeypatch.context() as short:
-            short.setattr(zenoh_bus, "_CLIENT_OPEN_TIMEOUT_MS", 1)
-            flight.listen()
-        assert flight.all_hear(10.0)
-        for _ in range(MOST_RESTARTS):
-            flight.restart_router()
-            if not flight.all_hear(3.0):
-                break
-        assert len(flight.hearing) < LISTENERS
-        assert len(flight.heard) == LISTENERS, "who is deaf is heard"
+def deafen(bus: ZenohBus) -> None:
+    """Take the ears of its session away; it goes on to send, and its token stays."""
+    for _, subscriber in itertools.chain(*bus._now.subscribers.values()):
+        subscriber.undeclare()
+    bus._now.tokens.undeclare()
 
 
-def test_with_a_time_limit_longer_than_the_routers_nobody_goes_deaf() -> None:
-    with scene(deaf_s=NEVER_S) as flight:
-        flight.listen()
-        assert flight.all_hear(10.0)
-        for _ in range(3):
-            flight.restart_router()
-            assert flight.all_hear(15.0)
+def test_a_deaf_session_is_replaced(endpoint: str) -> None:
+    with pair(endpoint, deaf_s=1.0) as (listener, talker):
+        deafen(listener)
+        listener.publish(COMMAND, b"command")
+        assert not hears(listener, talker, 0.5), "it is deaf"
+        assert heard_of(listener, talker), "and is heard"
+        assert hears(listener, talker, 10.0)
+        assert listener.reopened() == 1
+        assert heard_of(listener, talker)
+        time.sleep(0.5)
+        assert listener.alive() == talker.alive() == {"agent-0", "agent-1"}
+        assert dict(talker.arrivals()) == {"agent-0": 1, "agent-1": 1}, "for others nobody left"
+        assert hears(listener, talker, 1.0)
+        assert listener.reopened() == 1
+
+
+def heard_of(listener: ZenohBus, talker: ZenohBus) -> bool:
+    until_s = time.monotonic() + 5.0
+    while time.monotonic() < until_s:
+        listener.publish(COMMAND, b"command")
+        time.sleep(0.02)
+        if talker.receive(COMMAND):
+            return True
+    return False
+
+
+def test_control_it_stays_deaf_if_nothing_replaces_it(endpoint: str) -> None:
+    with pair(endpoint, deaf_s=1e9) as (listener, talker):
+        deafen(listener)
+        assert not hears(listener, talker, 3.0)
+        assert heard_of(listener, talker)
+
+
+def test_it_is_replaced_at_once_if_asked_for(endpoint: str) -> None:
+    with pair(endpoint, deaf_s=1e9) as (listener, talker):
+        deafen(listener)
+        assert listener.reopen()
+        assert hears(listener, talker, 5.0)
+
+
+def test_nobody_is_asked_where_there_is_no_router(endpoint: str) -> None:
+    with pair(endpoint, deaf_s=1e9) as (listener, _):
+        listener._socket = Path("/nowhere/bus.sock")
+        assert not listener.reopen()
+        listener.close()
+        assert not listener.reopen()
+
+
+def test_a_sealed_session_is_believed_after_it_was_replaced(tmp_path: Path) -> None:
+    """The seals of the process go on: for those who hear it nothing begins anew, and nothing is a replay."""
+    make_identities(tmp_path, {"alpha": LOOPBACK, "bravo": LOOPBACK, "charlie": LOOPBACK, STATION: None})
+    swarm = SwarmOfHosts.of(tmp_path, free_ports(3))
+
+    def joined(me: str, listen: dict[Any, list[str]]) -> Bus:
+        return join_bus(
+            swarm.endpoint("alpha"),
+            "run",
+            me,
+            listen,
+            identity=swarm.identity("alpha"),
+            max_age_us=FOR_AGENTS_US,
+            utc_us=lambda: time.time_ns() // 1000,
+        )
+
+    with swarm.router("alpha"):
+        supervisor = joined("alpha", {STATUS: ["agent-0"]})
+        agent = joined("agent-0", {COMMAND: ["alpha"]})
+        assert hears(supervisor, agent, 10.0)
+        for bus in (supervisor, agent):
+            assert bus.reopen()
+        until_s = time.monotonic() + 5.0
+        while not (supervisor.reopened() and agent.reopened()) and time.monotonic() < until_s:
+            hears(supervisor, agent, 0.1)
+            agent.receive(COMMAND)
+        assert supervisor.reopened() == agent.reopened() == 1
+        supervisor.refused()
+        assert hears(supervisor, agent, 5.0)
+        assert supervisor.refused() == []
+        supervisor.close()
+        agent.close()
+
+
+def test_no_client_gives_up_the_opening_of_a_session_before_its_router_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a client gives up in the middle of its opening is a session that is deaf for good."""
+    asked: list[Mapping[str, Any]] = []
+
+    def refuse(settings: Mapping[str, Any]) -> None:
+        asked.append(settings)
+        raise zenoh_bus.zenoh.ZError("refused")
+
+    monkeypatch.setattr(zenoh_bus, "open_session", refuse)
+    with pytest.raises(StartError):
+        ZenohBus(f"{zenoh_bus.SCHEME}/nowhere/bus.sock", "run", "agent-0", {})
+    assert asked[0]["transport/unicast/open_timeout"] > ROUTER_GIVES_UP_MS
