@@ -23,8 +23,8 @@ protection, which must fail, `--only 'clock*'` some of them, and `--plays 10` al
 In every row, by true states, two vehicles stay 0.8 m apart (or what the row says), none that was disarmed is armed
 again, and none that its autopilot or a pilot has taken follows setpoints again unasked; no process, socket or note is
 left, and the run folder can be read. Rows are flown in lockstep, are launches of real *processes*, or are a *test* of
-`tests/closed_loop/` whose negative control is the row without its protection. The tests play a sample. Networks of
-several hosts are flown by `tools/hosts_flight.py` ([hosts](hosts.md)), stops in every phase by `tools/stop_matrix.py`.
+`tests/` whose negative control is the row without its protection. The tests play a sample. Networks of several hosts
+are flown by `tools/hosts_flight.py` ([hosts](hosts.md)), stops in every phase by `tools/stop_matrix.py`.
 """
 
 

@@ -1,16 +1,24 @@
-"""Rows that closed-loop tests play."""
+"""Rows that closed-loop tests play, and tests of processes."""
 
 from __future__ import annotations
 
 from tests.faults.elsewhere import ElsewhereRow
 
-_IN = "tests/closed_loop/"
+_FLOWN, _PROCESSES = "tests/closed_loop/", "tests/process/"
 
 
 def _row(
-    name: str, event: str, reaction: str, within_s: float, protection: str, file: str, test: str, control: str
+    name: str,
+    event: str,
+    reaction: str,
+    within_s: float,
+    protection: str,
+    file: str,
+    test: str,
+    control: str,
+    folder: str = _FLOWN,
 ) -> ElsewhereRow:
-    where = f"{_IN}{file}::test_"
+    where = f"{folder}{file}::test_"
     return ElsewhereRow(
         name=name,
         event=event,
@@ -164,6 +172,28 @@ ROWS = tuple(
             "test_gusts.py",
             "vehicles_that_are_blown_out_of_their_tubes_commit_anew_and_keep_apart",
             "negative_control_vehicles_that_chase_what_they_were_committed_to_touch",
+        ),
+        (
+            "supervisor-deaf",
+            "the supervisor's session of the bus sends, and receives nothing any more",
+            "it opens another one before it calls any agent silent; all fly on and complete",
+            5.0,
+            "the own session is doubted first",
+            "test_launch_flight.py",
+            "a_supervisor_that_is_deaf_hears_its_agents_again_and_calls_none_silent",
+            "control_a_supervisor_that_believes_its_deaf_session_lands_its_agents",
+            _PROCESSES,
+        ),
+        (
+            "session-deaf",
+            "the session of an agent, a station or a viewer sends, and receives nothing any more",
+            "another one takes over; for the others nobody has left",
+            4.0,
+            "who hears nobody at all doubts the own session",
+            "test_deaf_bus.py",
+            "a_deaf_session_is_replaced",
+            "control_it_stays_deaf_if_nothing_replaces_it",
+            _PROCESSES,
         ),
     )
 )

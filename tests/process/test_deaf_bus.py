@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
 import swarmctl.bus.zenoh_bus as zenoh_bus
 from swarmctl.bus.network.identities import make_identities
@@ -160,7 +161,7 @@ def test_no_client_gives_up_the_opening_of_a_session_before_its_router_does(monk
 
     def refuse(settings: Mapping[str, Any]) -> None:
         asked.append(settings)
-        raise zenoh_bus.zenoh.ZError("refused")
+        raise zenoh.ZError("refused")
 
     monkeypatch.setattr(zenoh_bus, "open_session", refuse)
     with pytest.raises(StartError):
