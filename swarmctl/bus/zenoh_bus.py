@@ -31,7 +31,7 @@ CONNECT_TIMEOUT_MS = 10_000
 CLOSE_DEADLINE_S = 2.0
 _MAX_MESSAGE_BYTES = 1 << 20
 _ALIVE_RING = 1024
-_SETTLE_S = 0.2  # until a new session knows who is there
+_WHO_IS_THERE_S = 5.0  # longest that a new session asks before it takes over
 _LINK_OPEN_TIMEOUT_MS = 2000  # of links between routers: a cut one is tried again as often
 # A client waits for longer than the router does (accept_timeout, 10 s), because its own time limit may strike when
 # half of the opening is done: then it sends and is kept alive, but never reads (Zenoh 1.10.2). A client that got no
@@ -94,6 +94,7 @@ class ZenohBus(Bus):
     ) -> None:
         self._me, self._seal_bytes = me, seal_bytes
         self._socket = socket_file(endpoint)
+        self._tokens_key = f"swarm/{run}/*/alive"
         self._join: Callable[[], _Joined] = partial(
             _join, endpoint, f"swarm/{run}", me, subscriptions, lease_ms, connect_timeout_ms
         )
@@ -157,9 +158,11 @@ class ZenohBus(Bus):
             close_within(self._next.session, CLOSE_DEADLINE_S)
 
     def _open_next(self) -> None:
-        with contextlib.suppress(StartError):
+        with contextlib.suppress(StartError, zenoh.ZError):
             joined = self._join()
-            time.sleep(_SETTLE_S)
+            # The answers come after those of the token subscriber, which was declared before: nobody is missed.
+            for _ in joined.session.liveliness().get(self._tokens_key, timeout=_WHO_IS_THERE_S):
+                pass
             if self._is_closed:
                 close_within(joined.session, CLOSE_DEADLINE_S)
             else:

@@ -35,7 +35,8 @@ class BusReport:
         self._refusals.report(utc_us)
         reopened = self._bus.reopened()
         if reopened > self._reopened:
-            self._reopened = reopened
             text = "nobody was heard on the bus: its session may have been deaf, another was opened"
             self._note(REOPENED, text=text, count=reopened)
-            self._display.print_line(text)
+            if not self._reopened:  # while there is nobody, that happens again and again
+                self._display.print_line(text)
+            self._reopened = reopened

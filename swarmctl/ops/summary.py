@@ -140,7 +140,7 @@ def _unresponsive(comms: Mapping[str, Any]) -> str:
 def _reopened(comms: Mapping[str, Any]) -> str:
     """Return how often the session of a process was deaf, or seemed so, and was replaced."""
     count = comms.get("reopened")
-    return f"; {count} bus sessions opened again" if count else ""
+    return f"; bus sessions opened again: {count}" if count else ""
 
 
 def violation_lines(summary: Mapping[str, Any]) -> tuple[str, ...]:

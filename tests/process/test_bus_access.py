@@ -123,6 +123,12 @@ def test_a_revoked_identity_has_a_link_and_no_rights(
     add_identity(swarm.folder, "charlie", LOOPBACK)
     with routers(swarm, stolen=stolen):
         heard = what_is_heard(swarm, ("bravo", "charlie"))
+        ear, mouth = swarm.plain("charlie", "ear", {PATH: ["agent-1"]}), swarm.plain("bravo", "agent-1")
+        for _ in range(50):
+            mouth.publish(PATH, b"path")
+            time.sleep(0.02)
+        assert ear.receive(PATH) == [], "it hears nothing either"
+        assert ear.alive() - {"ear"} <= set(AGENTS[2:]), "and sees none of the others' tokens"
     assert not {said for at in heard for said in heard[at] if said[0] == "charlie"}
     assert ("bravo", "agent-1", "path") in heard["alpha"], "the others are heard: this can fail"
 

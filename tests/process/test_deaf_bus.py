@@ -81,6 +81,7 @@ def test_a_deaf_session_is_replaced(endpoint: str) -> None:
         assert heard_of(listener, talker), "and is heard"
         assert hears(listener, talker, 10.0)
         assert listener.reopened() == 1
+        assert listener.alive() == {"agent-0", "agent-1"}, "from the first moment on: who is absent is taken for ended"
         assert heard_of(listener, talker)
         time.sleep(0.5)
         assert listener.alive() == talker.alive() == {"agent-0", "agent-1"}
