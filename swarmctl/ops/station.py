@@ -11,11 +11,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from swarmctl.bus.json_messages import decode_status
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.topics import STATUS, TICK
+from swarmctl.bus.topics import TICK
 from swarmctl.config import Config, own_identity
 from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.records import unpack_tick
@@ -108,9 +107,8 @@ class SwarmWatch:
             tick = unpack_tick(payload)
             if tick is not None:
                 self._recorders[sender].tick(tick[0], None)
-        for sender, payload in self._bus.receive(STATUS):
-            status = decode_status(payload)
-            if status is not None and 0 <= status.agent < len(self._views) and sender == agent_name(status.agent):
+        for status in self._report.statuses():
+            if 0 <= status.agent < len(self._views):
                 view = self._views[status.agent]
                 view.status, view.received_s = status, now_s
         self._report.step()

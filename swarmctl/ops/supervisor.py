@@ -11,10 +11,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from swarmctl.bus.json_messages import decode_status
 from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.topics import COMMAND, ENDED, STATUS, Topic
+from swarmctl.bus.topics import COMMAND, ENDED, Topic
 from swarmctl.config import Config
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
@@ -137,10 +136,9 @@ class FlightSupervisor:
                 view.received_s += paused_s if view.status is not None else 0.0
 
     def _receive(self) -> None:
-        for sender, payload in self._bus.receive(STATUS):
-            status = decode_status(payload)
-            view = next((view for view in self._views if status is not None and view.agent == status.agent), None)
-            if status is None or view is None or sender != agent_name(status.agent):
+        for status in self._report.statuses():
+            view = next((view for view in self._views if view.agent == status.agent), None)
+            if view is None:  # of another computer
                 continue
             if view.status is None or view.status.phase != status.phase:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))

@@ -399,15 +399,15 @@ def test_a_launcher_that_did_not_run_calls_nobody_silent(tmp_path: Path) -> None
     assert (result.exit_code(violated=False), result.problems) == (EXIT_OK, [])
 
 
-def deaf_flight(directory: Path, opening_s: float) -> ScriptedServices:
-    scene = ScriptedServices(directory, [ends(0, 4.0), ends(0, 4.0)])
+def deaf_flight(directory: Path, script: str, opening_s: float = 1.0) -> ScriptedServices:
+    scene = ScriptedServices(directory, [script, script])
     assert scene.bus is not None
     scene.bus = DeafBus(scene.bus, time.monotonic() + 0.5, opening_s)
     return scene
 
 
 def test_a_supervisor_that_is_deaf_hears_its_agents_again_and_calls_none_silent(tmp_path: Path) -> None:
-    scene = deaf_flight(tmp_path, opening_s=1.0)  # the silence lasts longer than that of an agent may
+    scene = deaf_flight(tmp_path, ends(0, 6.0))  # the silence lasts longer than that of an agent may
     result = scene.fly()
     assert (result.exit_code(violated=False), result.problems) == (EXIT_OK, [])
     assert scene.printed("agent-0", "its process runs", "another session")
@@ -420,7 +420,7 @@ def test_control_a_supervisor_that_believes_its_deaf_session_lands_its_agents(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Hearing, "is_silent", lambda self, agent, silent_s, limit_s: silent_s > limit_s)
-    scene = deaf_flight(tmp_path, opening_s=1.0)
+    scene = deaf_flight(tmp_path, FLIES_LONG)
     assert scene.fly().exit_code(violated=False) == EXIT_MISSION
     assert scene.printed("agent-0", "silent")
     assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [130, 130]

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
+from swarmctl.bus.json_messages import encode_message
 from swarmctl.bus.peers import Bus, LocalHub
-from swarmctl.bus.refusals import FORGED, REPLAYED, RefusedMessage
+from swarmctl.bus.refusals import FORGED, IDENTITY, MALFORMED, REPLAYED, RefusedMessage
+from swarmctl.bus.topics import STATUS
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.ops.bus_report import REOPENED, BusReport
 from swarmctl.ops.status_table import AgentView
+from tests import builders
 
 
 class Scripted(CountedBus):
@@ -66,3 +70,19 @@ def test_the_first_refused_message_of_a_kind_is_a_line_unless_it_is_harmless() -
         report.step()
     assert said.lines == ["status in the name of agent-1 refused: forged"]
     assert {fields["reason"] for event, fields in said.events if event == "refused"} == {FORGED, REPLAYED}
+
+
+def test_only_statuses_by_the_agent_they_are_of_are_taken_and_the_others_counted() -> None:
+    hub, said = LocalHub(itertools.count(1, 1_000_000).__next__), Said()
+    bus = hub.connect("alpha", {STATUS: ["agent-0"]})
+    agent = hub.connect("agent-0")
+    report = BusReport(bus, said.note, said)
+    for payload in (status_of(0), b"no status", status_of(1)):
+        agent.publish(STATUS, payload)
+    assert [status.agent for status in report.statuses()] == [0]
+    report.step()
+    assert {fields["reason"]: fields["count"] for _, fields in said.events} == {MALFORMED: 1, IDENTITY: 1}
+
+
+def status_of(agent: int) -> bytes:
+    return encode_message(builders.status_message(agent=agent))
