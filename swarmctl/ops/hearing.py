@@ -13,7 +13,7 @@ from swarmctl.bus.peers import Bus, agent_name
 
 _DOUBT_01 = 0.6  # of the limit of silence, after which another session is opened
 _ANEW_S = 1.0  # for which another session listens before an agent is called silent: five statuses
-_OPENING_S = 10.0  # longest that is waited for another session
+_OPENING_S = 5.0  # longest that is waited for another session, which takes milliseconds where the router runs
 
 
 @dataclass(slots=True, kw_only=True)

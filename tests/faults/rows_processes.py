@@ -40,6 +40,7 @@ from tests.process.test_launch import (
 )
 
 SUPERVISOR = "import swarmctl.ops.supervisor as supervisor\n"
+HEARING = "import swarmctl.ops.hearing as hearing\n"
 RAISES = """
 import json
 import swarmctl.telemetry.recording.event_log as log
@@ -120,9 +121,9 @@ ROWS = (
         event="the router is stopped for 3 s",
         reaction="all come to rest, then the mission is completed",
         within_s=90.0,
-        protection="agents are silent for 5 s before they are given up",
+        protection="agents are silent for 5 s, also on another session if one can be opened, before they are given up",
         script=router_stopped,
-        off=in_program("launch", SUPERVISOR + "supervisor._SILENCE_S = 0.5"),
+        off=in_program("launch", SUPERVISOR + "supervisor._SILENCE_S = 0.5\n" + HEARING + "hearing._OPENING_S = 0.0"),
     ),
     LaunchedRow(
         name="process-router-killed-4-times",
