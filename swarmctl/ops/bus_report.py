@@ -44,7 +44,7 @@ class BusReport:
         self._refusals.report(time.time_ns() // 1000)
         reopened = self._bus.reopened()
         if reopened > self._reopened:
-            text = "nobody was heard on the bus: its session may have been deaf, another was opened"
+            text = "another session of the bus has taken over: the one before may have been deaf"
             self._note(REOPENED, text=text, count=reopened)
             if not self._reopened:  # while there is nobody, that happens again and again
                 self._display.print_line(text)
