@@ -17,6 +17,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from swarmctl.bus import inboxes
+from swarmctl.bus.inboxes import Message
 from swarmctl.bus.links import PERFECT, Impairments, Link
 from swarmctl.bus.path_messages import decode_path
 from swarmctl.bus.peer_clocks import PeerClocks
@@ -162,17 +164,12 @@ class PeerPaths:
         return LATE if utc_us - path.t0_utc_us > self._max_age_us else ""
 
 
-class _Message(NamedTuple):
-    visible_us: int
-    payload: bytes
-
-
 class _Receiver(NamedTuple):
     """One that the messages of a sender on a topic go to."""
 
     name: str
     link: Link
-    inbox: deque[_Message] | None  # None: it does not subscribe, but its link draws as if it did
+    inbox: deque[Message] | None  # None: it does not subscribe, but its link draws as if it did
 
 
 class _Held(NamedTuple):
@@ -304,7 +301,7 @@ class LocalHub:
                 continue
             arrival_us = link.arrival_us(now_us, reliable=topic.reliable)
             if arrival_us is not None and inbox is not None:
-                _enqueue(inbox, _Message(arrival_us, payload), topic.ring, now_us)
+                inboxes.enqueue(inbox, Message(arrival_us, payload), topic.ring, now_us)
         if missed and topic.reliable:
             self._held.append(_Held(sender, topic, payload, frozenset(missed)))
 
@@ -349,7 +346,7 @@ class LocalBus(Bus):
         self._hub = hub
         self.name = name
         self._subscriptions = subscriptions
-        self._inboxes: dict[Topic, dict[str, deque[_Message]]] = {topic: {} for topic in subscriptions}
+        self._inboxes: dict[Topic, dict[str, deque[Message]]] = {topic: {} for topic in subscriptions}
 
     def publish(self, topic: Topic, payload: bytes) -> None:
         if self._hub.is_attached(self):
@@ -361,7 +358,7 @@ class LocalBus(Bus):
         now_us = self._hub.now_us()
         arrived: list[tuple[int, str, bytes]] = []
         for sender, inbox in self._inboxes.get(topic, {}).items():
-            _trim(inbox, topic.ring, now_us)
+            inboxes.trim(inbox, topic.ring, now_us)
             while inbox and inbox[0].visible_us <= now_us:
                 message = inbox.popleft()
                 payload = message.payload if len(message.payload) <= topic.max_bytes else TOO_LONG
@@ -380,25 +377,10 @@ class LocalBus(Bus):
         if self._hub.is_attached(self):
             self._hub.detach(self.name)
 
-    def inbox(self, topic: Topic, sender: str) -> deque[_Message] | None:
+    def inbox(self, topic: Topic, sender: str) -> deque[Message] | None:
         """Return where messages of a sender wait to be received; None for those that are not subscribed to."""
         if topic not in self._subscriptions:
             return None
         senders = self._subscriptions[topic]
         hears = sender != self.name if senders is None else sender in senders
         return self._inboxes[topic].setdefault(sender, deque()) if hears else None
-
-
-def _enqueue(inbox: deque[_Message], message: _Message, ring: int, now_us: int) -> None:
-    """Queue a message under way, in the order of arrival."""
-    place = len(inbox)
-    while place and inbox[place - 1].visible_us > message.visible_us:
-        place -= 1
-    inbox.insert(place, message)  # jitter reorders messages
-    _trim(inbox, ring, now_us)
-
-
-def _trim(inbox: deque[_Message], ring: int, now_us: int) -> None:
-    """Keep the newest `ring` messages that have arrived; messages under way do not count."""
-    while len(inbox) > ring and inbox[ring].visible_us <= now_us:
-        inbox.popleft()

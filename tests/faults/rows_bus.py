@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from swarmctl.agent import coordination, world_model
 from swarmctl.agent.coordination import Coordination
-from swarmctl.bus import peers
+from swarmctl.bus import inboxes, peers
 from swarmctl.bus.peers import PeerPaths
 from tests.faults.bus_events import (
     BELIEVES_ALL,
@@ -122,7 +122,7 @@ ROWS = (
         reacts=refused("replayed", 20),
         lasts_s=4.0,
         always=BUSY,
-        off=Off(patches=((peers, "_trim", lambda *_: None),)),
+        off=Off(patches=((inboxes, "trim", lambda *_: None),)),
     ),
     SimulatedRow(
         name="peer-2khz-numbers",
@@ -135,7 +135,7 @@ ROWS = (
         lasts_s=4.0,
         told=(r"agent-1 were refused",),
         always=BUSY,
-        off=Off(patches=((peers, "_trim", lambda *_: None),)),
+        off=Off(patches=((inboxes, "trim", lambda *_: None),)),
     ),
     SimulatedRow(
         name="bus-silent-10s",
