@@ -34,6 +34,7 @@ from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, TRUTH, read_par
 CONFIG = Path(__file__).parents[1] / "configs" / "three_hosts.toml"
 INTO_MISSION_S = 2.0  # when something is broken
 CUT_S = 5.0
+STOP_S = 8.0
 START_S = 120.0
 FLIGHT_S = 240.0
 _GRID_US = 20_000
@@ -162,6 +163,13 @@ def _agent_killed(flight: Flight) -> None:
     os.kill(flight.agent_pid("bravo", 2), signal.SIGKILL)
 
 
+def _supervisor_stopped(flight: Flight) -> None:
+    process = flight.processes["bravo"]
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(STOP_S)
+    process.send_signal(signal.SIGCONT)
+
+
 @dataclass(frozen=True, slots=True)
 class Broken:
     """What is broken in a flight, and the host whose mission is not asked for then."""
@@ -177,6 +185,7 @@ SCENARIOS = {
     "cut": Broken(_cut),  # of one link, 5 s
     "isolated": Broken(_isolated),  # one host from all others, 5 s
     "agent-killed": Broken(_agent_killed, "bravo"),
+    "supervisor-stopped": Broken(_supervisor_stopped),  # of one host, 8 s, as if it got no processor
     "host-lost": Broken(_host_lost, "charlie"),
 }
 
