@@ -22,7 +22,7 @@ from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import OBSTACLES, OPERATOR, STATUS, TICK, Topic
 from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, socket_file
 from swarmctl.config import Config, dump
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text
 from swarmctl.ops.operator import RunningLaunch, announce, list_keepers, process_start_s, utc_us, withdraw
 from swarmctl.ops.preflight import LOOPBACK, ReservedPorts, inspect
@@ -59,6 +59,7 @@ class LaunchOptions:
 
     run_dir: Path | None = None
     view: bool = False  # open the viewer window
+    web: bool = False  # serve the view to browsers of this computer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,6 +109,8 @@ def started(config: Config, options: LaunchOptions, part: SwarmPart) -> Iterator
     Raises:
         ConfigError, StartError: it was refused, or did not come up; nothing is left running.
     """
+    if options.web and not config.telemetry.enabled:
+        raise ConfigError("--web", ["telemetry.enabled = false: there is no view"])
     reserved = inspect(config, part.agents)
     try:
         directory = _run_folder(config, options)
@@ -170,7 +173,8 @@ class Launcher(Services):
         self._spawn(router_command(config, context, self._links))
         self.bus = self._join_bus()
         if reserved.view_port:
-            self._spawn(viewer_command(config, context, reserved.view_port, self._options.view))
+            options = self._options
+            self._spawn(viewer_command(config, context, reserved.view_port, view=options.view, web=options.web))
         if config.sitl.enabled and context.agents:
             self._spawn(sitl_command(config, context, reserved.ports, reserved.vehicle_sockets))
         for command in agent_commands(config, context, reserved.sockets, reserved.vehicle_sockets):

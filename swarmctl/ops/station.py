@@ -11,12 +11,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from swarmctl.bus.json_messages import decode_status
+from swarmctl.bus.json_messages import decode_obstacles, decode_status
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.topics import STATUS, TICK
+from swarmctl.bus.topics import OBSTACLES, STATUS, TICK
 from swarmctl.config import Config, own_identity
 from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.records import unpack_tick
@@ -29,6 +29,7 @@ from swarmctl.ops.status_table import AgentView, Display
 from swarmctl.ops.summary import sum_up
 from swarmctl.ops.supervisor import LaunchResult, report_refused
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.recorder import Recorder
 
 _STEP_S = 0.05
@@ -77,7 +78,7 @@ class SwarmWatch:
         agents: size of the swarm.
         directory: run folder for what they report.
         display: shows them.
-        note: is told of refused messages, see `Refusals`.
+        note: is told of refused messages, see `Refusals`, and of lists of obstacles.
         clock_s: monotonic time [s].
 
     Attributes:
@@ -95,7 +96,8 @@ class SwarmWatch:
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bus, self._display, self._clock_s = bus, display, clock_s
-        self._refusals = Refusals(note)
+        self._refusals, self._note = Refusals(note), note
+        self._obstacles_version: int | None = None
         self._views = [AgentView(agent=agent) for agent in range(agents)]
         self._recorders = {agent_name(agent): Recorder(directory, agent) for agent in range(agents)}
         self.problems: list[str] = []
@@ -113,6 +115,11 @@ class SwarmWatch:
             if status is not None and 0 <= status.agent < len(self._views) and sender == agent_name(status.agent):
                 view = self._views[status.agent]
                 view.status, view.received_s = status, now_s
+        for _, payload in self._bus.receive(OBSTACLES):
+            message = decode_obstacles(payload)
+            if message is not None and message.replaces(self._obstacles_version):
+                self._obstacles_version = message.version
+                self._note("obstacles", **recorded_list(message))
         report_refused(self._bus, self._refusals, self._display)
         self._display.show(self._views)
         over = all(self._has_ended(view, now_s) for view in self._views)

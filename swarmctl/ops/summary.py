@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
 from swarmctl.mavlink.signing.refusals import HARMLESS
 from swarmctl.ops.supervisor import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
-
-if TYPE_CHECKING:
-    from swarmctl.telemetry.evaluation.referee import Rules
-
 
 def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Callable[[str], None]) -> bool:
     """Finish the run folder and print the result; return whether the referee found a violation.
@@ -26,10 +21,8 @@ def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Ca
     from swarmctl.telemetry.view.recordings import optimize_recording  # heavy
 
     try:
-        rules = _rules(config, result)
-        summary, unwritten = finish_run(
-            directory, rules, Outcome(outcome=result.outcome, problems=tuple(result.problems))
-        )
+        outcome = Outcome(outcome=result.outcome, problems=tuple(result.problems))
+        summary, unwritten = finish_run(directory, config.rules(), outcome)
     except Exception as error:
         known = {"outcome": result.outcome, "violations": list(result.problems)}
         for line in (*violation_lines(known), *summary_lines(known, directory)):
@@ -87,12 +80,6 @@ def compare(directories: Sequence[Path], output: Path | None) -> Path:
     runs = [(directory, load_recorded(directory).rules()) for directory in directories]
     names = "-against-".join(directory.resolve().name for directory in directories)
     return compare_runs(output or directories[-1].resolve().parent / f"{names}.html", runs)
-
-
-def _rules(config: Config, result: LaunchResult) -> Rules:
-    """Return the limits of the configuration, with obstacles as an operator left them."""
-    rules = config.rules()
-    return rules if result.obstacles is None else replace(rules, obstacles=result.obstacles)
 
 
 def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:

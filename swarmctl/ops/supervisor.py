@@ -9,7 +9,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -27,8 +27,8 @@ from swarmctl.ops.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.status_table import AgentView, Display, name_of
-from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 from swarmctl.telemetry.recording.event_log import EventLog
+from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 
 _STEP_S = 0.05
 _FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
@@ -74,7 +74,6 @@ class LaunchResult:
     has_armed: bool = False  # an agent has requested arming
     left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
     interrupted: bool = False
-    obstacles: tuple[JudgedObstacle, ...] | None = None  # all there were; None: as configured
 
     @property
     def outcome(self) -> str:
@@ -108,17 +107,6 @@ def why_it_failed(outcome: str, last_line: str) -> str:
     return (outcome if outcome != "completed" else "") or last_line or "no reason given"
 
 
-def _judged(known: tuple[JudgedObstacle, ...], message: ObstaclesMessage, utc_us: int) -> tuple[JudgedObstacle, ...]:
-    """Return all obstacles there were: those known that a list lacks are there until now, those it adds are new."""
-    listed = [
-        JudgedObstacle(number=item.number, obstacle=item.obstacle, since_utc_us=item.since_utc_us)
-        for item in message.obstacles
-    ]
-    there = set(listed)
-    kept = [j if j in there or j.until_utc_us is not None else replace(j, until_utc_us=utc_us) for j in known]
-    return (*kept, *(judged for judged in listed if judged not in kept))
-
-
 class FlightSupervisor:
     """Watches one launch until every agent has ended or has been given up."""
 
@@ -132,7 +120,6 @@ class FlightSupervisor:
         self._result = LaunchResult()
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
         self._obstacles = first_list(config.obstacles, time.time_ns() // 1000)
-        self._result.obstacles = _judged((), self._obstacles, 0)
         self._obstacles_said_s = 0.0
         self._refusals = Refusals(services.log.write)
         self._started_s = self._stepped_s = time.monotonic()
@@ -152,6 +139,9 @@ class FlightSupervisor:
         Args:
             interrupts: number of stop requests; the first lands all agents, the second kills all processes.
         """
+        if self._obstacles.obstacles:
+            text = f"{len(self._obstacles.obstacles)} obstacles, as configured"
+            self._services.log.write("obstacles", text=text, **recorded_list(self._obstacles))
         while interrupts() < 2:
             self._excuse_own_pause()
             self._receive()
@@ -211,10 +201,9 @@ class FlightSupervisor:
         report_refused(self._bus, self._refusals, self._display)
 
     def _adopt(self, message: ObstaclesMessage) -> None:
-        """Adopt an operator's obstacle list: repeat it, judge what is new from now on and what is gone until now."""
-        self._result.obstacles = _judged(self._result.obstacles or (), message, time.time_ns() // 1000)
+        """Adopt an operator's obstacle list: repeat it, and record it for the referee."""
         self._obstacles, self._obstacles_said_s = message, 0.0
-        self._announce("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
+        self._announce("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", **recorded_list(message))
 
     def _watch_essential_processes(self) -> None:
         """Start a router again; land all agents when it ends again and again, or the simulator has ended."""
@@ -250,6 +239,10 @@ class FlightSupervisor:
                 address = line.removeprefix("viewer ")
                 self._announce("viewer_ready", f"view {address}", url=address)
                 self._services.announce(address)
+        elif "page" not in self._reported and (line := child.line_with("page http://")):
+            self._reported.add("page")
+            page = line.removeprefix("page ")
+            self._announce("page_ready", f"open in a browser: {page}", url=page)
         elif child.is_stopped() and self._is_first("viewer stopped"):
             self._announce("viewer_frozen", "viewer is frozen; the flight goes on")
 

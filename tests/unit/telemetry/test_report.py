@@ -92,6 +92,20 @@ def test_references_are_compared_at_the_same_mission_times() -> None:
     assert shared_references({0: flight(0, 3, 6.0)[0], 1: late, 2: away}) == {0: [0, 1], 2: [2]}
 
 
+def test_goals_are_those_of_the_mission_that_an_operator_has_set_last(tmp_path: Path) -> None:
+    directory = finish(tmp_path / "changed", goals=True)
+    ticks = load_run(directory).ticks
+    for agent, rows in ticks.items():
+        tracking = np.flatnonzero(rows["phase"] == Phase.TRACK)
+        again = tracking[len(tracking) // 2 :]  # all of one mission, then each another place, two of them the same
+        rows["mission_t_s"][again] -= rows["mission_t_s"][again[0]]
+        rows["ref_pos_ned_m"][again] = (-4.0, max(agent, 1), -1.0)
+        rows.tofile(directory / f"agent-{agent}.ticks")
+    report([directory])
+    above = figures((directory / "report.html").read_text())["From above: north up, east right [m]"]
+    assert re.findall(r">(goal[^<]*)</text>", above) == ["goal 0, 1", "goal 2"]
+
+
 def test_every_colour_of_a_page_is_known_by_day_and_in_the_dark(folder: Path) -> None:
     page = (folder / "report.html").read_text()
     light, dark = page.split("@media (prefers-color-scheme: dark)", 1)
