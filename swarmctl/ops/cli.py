@@ -282,8 +282,8 @@ def fault(
     as_json: AsJson = False,
 ) -> int:
     """Inject a fault into the simulator of a running launch. Refused where real vehicles fly."""
-    from swarmctl.ops import operator
     from swarmctl.ops import fault as faults
+    from swarmctl.ops import operator
 
     launch = operator.find_launch(run)
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}

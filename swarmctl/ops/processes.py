@@ -153,7 +153,7 @@ class Child:
     """A started process. Start it from the main thread: the kernel ties its life to the thread that did."""
 
     def __init__(self, command: Command, directory: Path) -> None:
-        self.name = command.name
+        self.name, self.argv = command.name, command.argv
         self.log = directory / f"{command.name}.log"
         self.ended_s: float | None = None
         try:

@@ -24,10 +24,11 @@ from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.host import refuse_unidentified, shared_run_name
 from swarmctl.ops.launch import LaunchOptions, SwarmPart, started
-from swarmctl.ops.processes import ROUTER
+from swarmctl.ops.processes import ROUTER, VIEWER
 from swarmctl.ops.status_table import AgentView, Display
 from swarmctl.ops.summary import sum_up
 from swarmctl.ops.supervisor import LaunchResult, report_refused
+from swarmctl.ops.viewer_watch import ViewerWatch
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.recorder import Recorder
@@ -56,8 +57,10 @@ def run_station(config: Config, options: LaunchOptions) -> int:
                 services.display,
                 note=services.log.write,
             )
+            viewer = ViewerWatch(services.children.get(VIEWER), services.tell, services.announce)
             router = services.children[ROUTER]
             while not (stop.count or watch.step()):
+                viewer.step()
                 if router.poll() is not None:
                     watch.problems.append(f"router {router.how_it_ended()}; see {router.log}. The swarm flies on")
                     break

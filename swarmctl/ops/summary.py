@@ -12,6 +12,7 @@ from swarmctl.mavlink.signing.refusals import HARMLESS
 from swarmctl.ops.supervisor import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 
+
 def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Callable[[str], None]) -> bool:
     """Finish the run folder and print the result; return whether the referee found a violation.
 

@@ -27,6 +27,7 @@ from swarmctl.ops.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.status_table import AgentView, Display, name_of
+from swarmctl.ops.viewer_watch import ViewerWatch
 from swarmctl.telemetry.recording.event_log import EventLog
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 
@@ -118,6 +119,7 @@ class FlightSupervisor:
         self._bus: Bus = services.bus
         self._display = display
         self._result = LaunchResult()
+        self._viewer_watch = ViewerWatch(services.children.get(VIEWER), self._announce, services.announce)
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
         self._obstacles = first_list(config.obstacles, time.time_ns() // 1000)
         self._obstacles_said_s = 0.0
@@ -146,7 +148,7 @@ class FlightSupervisor:
             self._excuse_own_pause()
             self._receive()
             self._watch_essential_processes()
-            self._watch_viewer()
+            self._viewer_watch.step()
             self._watch_agents()
             self._watch_time()
             if interrupts() and not self._result.interrupted:
@@ -223,28 +225,6 @@ class FlightSupervisor:
                 self._result.could_not_start |= not any(view.status for view in self._views)
                 self._fail(f"{name}_ended", f"{name} {child.how_it_ended()}; landing. See {child.log}")
                 self._land(land_s)
-
-    def _watch_viewer(self) -> None:
-        child = self._services.children.get(VIEWER)
-        if child is None:
-            return
-        if child.poll() is not None:
-            if self._is_first(VIEWER):
-                self._announce(
-                    "viewer_ended", f"view and recording stopped: viewer {child.how_it_ended()}; the flight goes on"
-                )
-        elif "view address" not in self._reported:
-            line = child.line_with("viewer rerun+")
-            if line and self._is_first("view address"):
-                address = line.removeprefix("viewer ")
-                self._announce("viewer_ready", f"view {address}", url=address)
-                self._services.announce(address)
-        elif "page" not in self._reported and (line := child.line_with("page http://")):
-            self._reported.add("page")
-            page = line.removeprefix("page ")
-            self._announce("page_ready", f"open in a browser: {page}", url=page)
-        elif child.is_stopped() and self._is_first("viewer stopped"):
-            self._announce("viewer_frozen", "viewer is frozen; the flight goes on")
 
     def _watch_agents(self) -> None:
         now_s = time.monotonic()

@@ -123,8 +123,8 @@ def bundle(
     logs: Annotated[int, typer.Option("--logs", min=0, help="Newest logs to download from each vehicle.")] = 1,
 ) -> int:
     """Pack a run for support: its folder, versions, and logs of the disarmed vehicles that are reached."""
-    from swarmctl.ops.bundle import BundleOptions
-    from swarmctl.ops.bundle import bundle as pack
+    from swarmctl.ops import bundle as packing
 
-    print(pack(BundleOptions(folder=folder, output=output, logs=logs)))
+    packed = packing.bundle(packing.BundleOptions(folder=folder, output=output, logs=logs))
+    print("\n".join(packing.lines_of(packed)))
     return EXIT_OK

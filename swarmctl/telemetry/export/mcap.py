@@ -160,7 +160,9 @@ class _Export:
         """Yield what draws each obstacle, until the next one of its number begins."""
         known = self._recorded.obstacles
         for k, judged in enumerate(known):
-            yield self._obstacle(judged, next((later for later in known[k + 1 :] if later.number == judged.number), None))
+            yield self._obstacle(
+                judged, next((later for later in known[k + 1 :] if later.number == judged.number), None)
+            )
 
     def _obstacle(self, judged: JudgedObstacle, following: JudgedObstacle | None) -> Messages:
         """Yield an obstacle while it is there: once, or five times a second where it moves."""

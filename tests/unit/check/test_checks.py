@@ -460,7 +460,7 @@ def test_the_radius_has_to_cover_body_tracking_and_estimator(config: Config) -> 
 def test_limits_of_battery_and_link_are_shown_and_the_return_is_one_of_them(config: Config) -> None:
     lines = findings([HEALTHY, SECOND_OK], config)
     assert line_of(lines, "battery").wanted == "over 50%, warns at 30%, returns at 20%, lands at 10%"
-    assert line_of(lines, "loss").wanted.endswith("warns at 20%")
+    assert line_of(lines, "loss").wanted == "under 1%; in flight: warns at 20% of 5 s without a new state"
     strict = FailsafeParams(battery_warn_01=0.8, battery_rtl_01=0.7)
     agent = config.agent.model_copy(update={"failsafe": strict})
     low = changed(
