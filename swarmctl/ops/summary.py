@@ -59,15 +59,15 @@ def rewrite_report(directory: Path) -> Path:
     return report_run(directory, load_recorded(directory).rules())
 
 
-def write_figures(directory: Path) -> Path:
-    """Write every figure of a run folder as an SVG file and return the folder they are in.
+def write_figures(directory: Path, *, png: bool) -> Path:
+    """Write every figure of a run folder as an SVG file, and as PNG too, and return the folder they are in.
 
     Raises:
         ConfigError: it is no folder of a finished run.
     """
     from swarmctl.telemetry.recording.run_folder import write_run_figures  # heavy
 
-    return write_run_figures(directory, load_recorded(directory).rules())
+    return write_run_figures(directory, load_recorded(directory).rules(), png=png)
 
 
 def compare(directories: Sequence[Path], output: Path | None) -> Path:

@@ -148,18 +148,18 @@ def report_run(directory: Path, rules: Rules) -> Path:
         raise StartError(f"{directory / REPORT}: can't be written: {error.strerror or error}") from error
 
 
-def write_run_figures(directory: Path, rules: Rules) -> Path:
-    """Write every figure of a finished run as an SVG file; returns their folder.
+def write_run_figures(directory: Path, rules: Rules, *, png: bool = False) -> Path:
+    """Write every figure of a finished run as an SVG file, and as PNG too; returns their folder.
 
     Raises:
         ConfigError: the run is not finished, or a file in the folder has not the expected content.
-        StartError: the folder can't be written to.
+        StartError: the folder can't be written to, or PNG needs a library that is not installed.
     """
     judged = read_judged(directory, rules)
     if (directory / FIGURES).is_symlink():
         raise ConfigError(str(directory / FIGURES), ["is a symbolic link. Remove it"])
     try:
-        return write_figures(directory, judged.run, judged.summary, rules=judged.rules)
+        return write_figures(directory, judged.run, judged.summary, rules=judged.rules, png=png)
     except OSError as error:
         raise StartError(f"{directory / FIGURES}: can't be written: {error.strerror or error}") from error
 

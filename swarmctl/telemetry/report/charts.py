@@ -112,6 +112,7 @@ def time_chart(
     from_zero: bool = False,
     ceiling: float | None = None,
     windows: Sequence[Window] = (),
+    x_unit: str = "s",
 ) -> Figure:
     """Return a chart over time.
 
@@ -126,6 +127,7 @@ def time_chart(
         from_zero: whether the value axis begins at 0.
         ceiling: largest value shown; higher ones leave the plot.
         windows: shaded parts, clipped to the plot.
+        x_unit: unit of the axis below, if that is no time.
     """
     low, high = _value_range([line.y for line in lines], [limit.value for limit in limits], from_zero, ceiling)
     x, y = _axes(svg.widened(*x_range), (low, high), height)
@@ -140,7 +142,7 @@ def time_chart(
     if band is not None:
         left, right = x.clipped_px(band)
         behind = element("rect", class_="band", x=left, y=svg.TOP_PX, width=right - left, height=tall)
-    return svg.figure(title, height, [behind, svg.grid(x, y), clipped], lines)
+    return svg.figure(title, height, [behind, svg.grid(x, y, x_unit), clipped], lines)
 
 
 def top_view(
@@ -278,7 +280,7 @@ def state_bars(title: str, rows: Sequence[tuple[str, Sequence[Span]]], x_range: 
             place = {"x": left, "y": top, "width": max(0.6, right - left), "height": 16}
             parts.append(element("rect", words, **place, fill=span.color))
     height = svg.TOP_PX + _BAR_PX * len(rows) + svg.BOTTOM_PX
-    parts.append(svg.axis_below(x, Axis(low=0.0, high=1.0, first=height - svg.BOTTOM_PX, last=svg.TOP_PX)))
+    parts.append(svg.axis_below(x, Axis(low=0.0, high=1.0, first=height - svg.BOTTOM_PX, last=svg.TOP_PX), "s"))
     return svg.figure(title, height, parts, states.values())
 
 

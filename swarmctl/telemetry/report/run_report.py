@@ -8,10 +8,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from swarmctl.files import replace_text
+from swarmctl.files import replace_bytes, replace_text
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR, Rules, RunData
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.report.pages import render
+from swarmctl.telemetry.report.png import png_of
 from swarmctl.telemetry.report.run_charts import RunCharts
 from swarmctl.telemetry.report.svg import Figure
 
@@ -51,13 +52,22 @@ def write_report(
     return path
 
 
-def write_figures(directory: Path, run: RunData, summary: Mapping[str, Any], *, rules: Rules | None = None) -> Path:
-    """Write every figure of a judged run as an SVG file into `figures/` of its folder; returns that folder."""
+def write_figures(
+    directory: Path, run: RunData, summary: Mapping[str, Any], *, rules: Rules | None = None, png: bool = False
+) -> Path:
+    """Write every figure of a judged run as SVG, and as PNG too, into `figures/` of its folder; returns that folder.
+
+    Raises:
+        StartError: PNG was asked for, and its library is not installed.
+    """
     charts, folder = RunCharts(run, summary, rules), directory / FIGURES
     folder.mkdir(exist_ok=True)
     for number, figure in enumerate([charts.seen_from_above(), *itertools.chain(*_sections(charts).values())], 1):
         words = re.sub(r"[^a-z0-9]+", "-", re.sub(r"\[.*?\]", "", figure.heading).lower()).strip("-")
-        replace_text(folder / f"{number:02}-{words}.svg", figure.as_file())
+        document, path = figure.as_file(), folder / f"{number:02}-{words}.svg"
+        replace_text(path, document)
+        if png:
+            replace_bytes(path.with_suffix(".png"), png_of(document))
     return folder
 
 
