@@ -126,7 +126,8 @@ class _Export:
     def _goals(self, agent: int, rows: NDArray[np.void]) -> Messages:
         """Yield the goal of an agent: the configured one, then that of each mission that was set in flight."""
         known = self._recorded.flight.agents
-        goals = [(self._begins_us, known[agent].goal_ned_m if agent < len(known) else None)]
+        first = known[agent].goal_ned_m if agent < len(known) else None
+        goals: list[tuple[int, Sequence[float] | Array | None]] = [(self._begins_us, first)]
         goals += [(int(mission["utc_us"][0]), goal_ned_m(mission)) for mission in missions(rows)[1:]]
         for utc_us, goal in goals:
             if goal is not None:

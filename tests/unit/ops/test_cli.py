@@ -221,6 +221,15 @@ def test_expected_errors_are_words_and_their_exit_code(
     assert captured.err == f"{error}\n"
 
 
+def test_a_page_of_a_launch_without_a_view_is_refused_before_anything_starts(
+    run: Run, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    assert run("launch", "--web", "--set", "telemetry.enabled=false", "--run-dir", str(folder)) == 2
+    assert capsys.readouterr().err == "--web: telemetry.enabled = false: there is no view\n"
+    assert not folder.exists()
+
+
 def test_errors_control_no_terminal(run: Run, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     hostile = str(tmp_path / "\x1b]0;owned\x07\x9b2J\u202e")
     assert run("land", "--run-dir", hostile) == 3

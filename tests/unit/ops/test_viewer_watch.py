@@ -14,7 +14,8 @@ class Viewer(Child):
     """A process of which everything is made up."""
 
     def __init__(self, *argv: str) -> None:
-        self.argv, self.said, self.code, self.stopped = argv, list[str](), None, False
+        self.argv, self.said, self.stopped = argv, list[str](), False
+        self.code: int | None = None
 
     def poll(self) -> int | None:
         return self.code
