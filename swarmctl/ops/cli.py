@@ -197,7 +197,7 @@ def agent(
     ] = False,
     identity: Annotated[str, typer.Option("--identity", help="Host it speaks for, one of [[hosts]].")] = "",
 ) -> int:
-    """Run one agent for one autopilot. `launch` starts agents; on a companion computer start it yourself."""
+    """Run one agent, whose vehicle and bus are there already. `launch` starts agents, and on companion computers `host`."""
     from swarmctl.agent.runner import AgentProcess, run_agent
     from swarmctl.process_lifetime import PARENT_ENV, die_with_parent
 
@@ -328,6 +328,12 @@ def bench(context: typer.Context) -> NoReturn:
 def sweep(context: typer.Context) -> NoReturn:
     """Fly every combination of values in lockstep, on all processors. Writes a table and charts; can be resumed."""
     _become("sitl.studies.sweep.command", context.args)
+
+
+@app.command(context_settings=_PASS_ON)
+def campaign(context: typer.Context) -> NoReturn:
+    """Fly seeded Monte Carlo campaigns in lockstep, and count collisions and arrivals. Can be resumed."""
+    _become("sitl.studies.campaign.command", context.args)
 
 
 def _become(module: str, arguments: list[str]) -> NoReturn:

@@ -292,7 +292,7 @@ def _introduction(config: Config, context: RunContext, reserved: ReservedPorts) 
         vehicles = f"built-in SITL ({config.sitl.preset}) on {LOOPBACK}"
     else:
         vehicles = ", ".join(config.vehicles[agent].url for agent in context.agents)
-    view = f"view on port {reserved.view_port}" if reserved.view_port else "no view"
+    view = "the view's address follows" if reserved.view_port else "no view"
     return (
         f"{context.run}: {agents}{of} agent{'s' if config.swarm.agents > 1 else ''}, {vehicles}",
         f"bus {context.endpoint}; {view}",

@@ -86,7 +86,7 @@ def compare(directories: Sequence[Path], output: Path | None) -> Path:
 def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:
     """Return five lines: outcome, separation, timing, solver and bus, folder."""
     violations = summary.get("violations") or []
-    separation, obstacles = _section(summary, "separation"), _section(summary, "obstacles")
+    obstacles = _section(summary, "obstacles")
     timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
     tick, solve, age = _section(timing, "tick_ms"), _section(timing, "solve_ms"), _section(comms, "path_age_ms")
     rejected = sum(_section(comms, "rejected").values())
@@ -99,7 +99,7 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
     clearance = obstacles.get("min_clearance_m")
     return (
         outcome,
-        f"separation {_m(separation.get('min_m'))} (required {_m(separation.get('required_m'))})"
+        _separation(summary)
         + (
             f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else ""
         ),
@@ -112,6 +112,13 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         + _deadlocks(summary),
         f"run folder {directory}",
     )
+
+
+def _separation(summary: Mapping[str, Any]) -> str:
+    found = _section(summary, "separation")
+    if summary.get("agents") == 1:
+        return "no other agent"
+    return f"separation {_m(found.get('min_m'))} (required {_m(found.get('required_m'))})"
 
 
 def _refused_frames(comms: Mapping[str, Any]) -> str:

@@ -158,7 +158,7 @@ def top_view(
     more_x = (wide / scale - (x_high - x_low)) / 2
     more_y = ((height - svg.TOP_PX - svg.BOTTOM_PX) / scale - (y_high - y_low)) / 2
     x, y = _axes((x_low - more_x, x_high + more_x), (y_low - more_y, y_high + more_y), height)
-    parts = [svg.grid(x, y)]
+    parts, marks = [svg.grid(x, y)], list[str]()
     for ball in balls:
         center = {"cx": float(x.px(ball.center_ned_m[1])), "cy": float(y.px(ball.center_ned_m[0]))}
         parts.append(element("circle", class_="obstacle", **center, r=float(ball.radius_m * scale)))
@@ -168,12 +168,13 @@ def top_view(
         if line.label and not line.dash and len(line.x) and np.isfinite(line.y[-1]):
             at = float(x.px(line.x[-1])), float(y.px(line.y[-1]))
             parts.append(dot(*at, 4, line.color))
-            parts += [svg.tick(at[0] + 7, at[1] - 8, line.end, "start")] if line.end else []
+            marks += [svg.mark(at[0] + 7, at[1] - 8, line.end)] if line.end else []
     for goal in goals:
         cx, cy = float(x.px(goal.pos_ned_m[1])), float(y.px(goal.pos_ned_m[0]))
         ring = element("circle", cx=cx, cy=cy, r="7", fill="none", stroke=goal.color, stroke_width="2")
-        parts += [ring, svg.tick(cx + 11, cy + 10, goal.label, "start")]
-    return svg.figure(title, height, parts, lines)
+        parts.append(ring)
+        marks.append(svg.mark(cx + 11, cy + 10, goal.label))
+    return svg.figure(title, height, [*parts, *marks], lines)
 
 
 def space_view(title: str, lines: Sequence[SpaceLine], balls: Sequence[Ball] = (), points: int = 600) -> Figure:

@@ -87,6 +87,7 @@ class SummaryRow(NamedTuple):
     limit: str = ""
     good: bool | None = None
     number: float | None = None  # to compare it with that of another run
+    note: str = ""  # what it is
 
 
 def _event_rows(run: RunData, charts: RunCharts) -> Iterator[tuple[str, object, object, str]]:
@@ -111,10 +112,10 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     late = f"{timing['late_ticks']} of {due}"
     limit = "" if most is None else f"{most:.0%}"
     yield SummaryRow("deadline misses", late, limit, good, timing["late_ticks"])
-    named = (f"summed mean tracking error ({SUMMED_ERROR})", "index_m"), ("the same after 10 s", "index_after_10s_m")
-    for name, key in named:
+    named = ("summed mean tracking error", "index_m", SUMMED_ERROR), ("the same after 10 s", "index_after_10s_m", "")
+    for name, key, note in named:
         error_m = summary["tracking"][key]
-        yield SummaryRow(name, _figure(error_m, "m", 3), number=error_m)
+        yield SummaryRow(name, _figure(error_m, "m", 3), number=error_m, note=note)
     for name, key in (("tick time", "tick_ms"), ("solve time", "solve_ms")):
         values = " / ".join(_figure(timing[key][part], "", 2) for part in ("p50", "p99", "max"))
         yield SummaryRow(f"{name}, median / p99 / max", f"{values} ms", number=timing[key]["p50"])
@@ -126,7 +127,7 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     yield SummaryRow("ticks in which the safety filter acted", str(solver.get("safety_filter_ticks", 0)))
     yield SummaryRow("largest residual of a flown plan", _figure(solver["max_residual_m"], "m", 5))
     ages = " / ".join(_figure(comms["path_age_ms"][part], "", 1) for part in ("p50", "p99"))
-    yield SummaryRow("age of peers' paths, median / p99", f"{ages} ms")
+    yield SummaryRow("plan staleness, median / p99", f"{ages} ms", note="age of the oldest of the peers' newest paths")
     refused = ", ".join(f"{reason} {count}" for reason, count in comms["rejected"].items()) or "none"
     yield SummaryRow("bus messages refused", refused)
     if (unresponsive := comms.get("unresponsive") or {}).get("count"):

@@ -89,6 +89,11 @@ def tick(px: float, py: float, text: str, anchor: str) -> Markup:
     return element("text", text, class_="tick", x=px, y=py, dy=".32em", text_anchor=anchor)
 
 
+def mark(px: float, py: float, text: str) -> Markup:
+    """Return a small text that begins at a point and is read over lines."""
+    return element("text", text, class_="tick mark", x=px, y=py, dy=".32em")
+
+
 def grid(x: Axis, y: Axis, x_unit: str = "") -> Markup:
     """Return horizontal lines with their values, and the axis below with its own, the last of them with a unit."""
     parts = []
