@@ -197,7 +197,7 @@ def agent(
     ] = False,
     identity: Annotated[str, typer.Option("--identity", help="Host it speaks for, one of [[hosts]].")] = "",
 ) -> int:
-    """Run one agent, whose vehicle and bus are there already. `launch` starts agents, and on companion computers `host`."""
+    """Run one agent, whose vehicle and bus are there already. `launch` and `host` start agents."""
     from swarmctl.agent.runner import AgentProcess, run_agent
     from swarmctl.process_lifetime import PARENT_ENV, die_with_parent
 
