@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from swarmctl import __version__
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.router_links import RouterLinks
 from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
@@ -184,7 +185,12 @@ class Launcher(Services):
             self.display.print_line(line)
         realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
         self.log.write(
-            "started", run=context.run, agents=list(context.agents), ports=list(reserved.ports), realtime=realtime
+            "started",
+            run=context.run,
+            version=__version__,
+            agents=list(context.agents),
+            ports=list(reserved.ports),
+            realtime=realtime,
         )
 
     @property
@@ -250,6 +256,7 @@ class Launcher(Services):
                 str(context.directory),
                 view,
                 context.identity,
+                __version__,
             )
         )
 

@@ -25,6 +25,7 @@ import psutil
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
+import swarmctl
 from swarmctl.config import load
 from swarmctl.core.types import Phase
 from swarmctl.mavlink.codec import Codec
@@ -396,6 +397,7 @@ def test_two_launches_at_once_beside_another_simulator(start: Start) -> None:
         others.terminate()
         others.wait(10)
     (one,), (other,) = first.events("started"), second.events("started")
+    assert one["version"] == other["version"] == swarmctl.__version__
     assert not set(one["ports"]) & set(other["ports"])
     assert one["run"] != other["run"]
 
