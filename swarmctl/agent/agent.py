@@ -342,6 +342,8 @@ class Agent:
             else:
                 self._alerts.put(asked, f"{asked} refused: {result.text}", now_us)
             self._note("command", verb=asked, ok=result.ok, text=result.text)
+        if (said := self._autopilot.next_text()) is not None:  # one a tick: a flood must not fill the disk
+            self._note("autopilot_text", severity=said.severity, text=said.text)
         frame = self._autopilot.frame
         if frame.jumps != self._jumps:
             self._jumps = frame.jumps

@@ -44,8 +44,9 @@ class WorldModel:
         bus: source of messages, drained by `listen`.
         rate_hz: tick rate of every agent.
         vouchers: agents of which each sender may say that they have ended.
-        note: receives the events `refused` (see `Refusals`) and `unresponsive`: a peer on the bus has published no
-            accepted path for `lost_after_s`; also when that ends, with its duration.
+        note: receives the events `refused` (see `Refusals`), `obstacles_changed` with the list as it was received, and
+            `unresponsive`: a peer on the bus has published no accepted path for `lost_after_s`; also when that ends,
+            with its duration.
     """
 
     def __init__(
@@ -134,6 +135,8 @@ class WorldModel:
             self.refusals.add(sender, topics.OBSTACLES.name, MALFORMED, utc_us)
         elif message.replaces(known):
             self._obstacles_version = message.version
+            if message.obstacles != self._obstacles:
+                self._note("obstacles_changed", version=message.version, listed=payload.decode(errors="replace"))
             unchanged = set(self._obstacles) & set(message.obstacles)
             self._seen = {item.number: item.obstacle for item in unchanged if item.number in self._seen}
             self._obstacles = message.obstacles

@@ -17,12 +17,13 @@ import msgspec
 from swarmctl.api.flight_process import FlightProcess
 from swarmctl.api.run import Run, load_run
 from swarmctl.config import Config, dump
-from swarmctl.core.operator_verbs import GOTO, POINT, SPEED, YAW, Order, order_problem
+from swarmctl.core.operator_verbs import GOTO, MISSION, POINT, SPEED, YAW, Order, order_problem
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.errors import ConfigError, MissionError, StartError
 from swarmctl.files import read_file, replace_text
+from swarmctl.ops.mission_file import set_mission
 from swarmctl.ops.operator import LAUNCH_FILE, RunningLaunch, read_statuses
-from swarmctl.ops.order_delivery import deliver
+from swarmctl.ops.order_delivery import Reply, deliver
 from swarmctl.telemetry.recording.run_files import CONFIG
 from swarmctl.telemetry.recording.run_folder import create_run_folder
 
@@ -144,6 +145,21 @@ class Swarm:
         chosen = {YAW: yaw_deg, SPEED: speed_m_s}
         self.order(GOTO, agent, **asked, **{name: value for name, value in chosen.items() if value is not None})
 
+    def set_mission(self, file: str | Path, agents: Agents = None) -> None:
+        """Fly the mission of a file from the same moment on, as `swarmctl mission set` does; see `order`.
+
+        Args:
+            file: TOML file that holds `[mission]` alone, as a configuration does.
+            agents: number of an agent, several numbers, or None for all.
+
+        Raises:
+            ConfigError: there is no such agent, or this swarm can't fly the mission; lists all problems.
+            StartError: the launch has ended.
+            MissionError: an agent refuses it or is silent; says which and why.
+        """
+        self._refuse_ended(MISSION)
+        _refuse_problems(set_mission(self._note(), Path(file), _numbers(agents)))
+
     def order(self, verb: str, agents: Agents = None, **arguments: float) -> None:
         """Give an order of the operator, and return once every agent asked has accepted it, and begun a stop.
 
@@ -160,10 +176,7 @@ class Swarm:
         if problem := order_problem(verb, arguments):
             raise ConfigError("order", [problem])
         self._refuse_ended(verb)
-        asked = [agents] if isinstance(agents, int) else list(agents or ())
-        replies = deliver(self._note(), Order(verb, arguments), asked)
-        if problems := [reply.problem for reply in replies if reply.problem]:
-            raise MissionError("\n".join(problems))
+        _refuse_problems(deliver(self._note(), Order(verb, arguments), _numbers(agents)))
 
     def status(self) -> dict[int, dict[str, Any]]:
         """Return the newest status of every agent that answers, by agent; phase and modes are words.
@@ -239,3 +252,18 @@ class Swarm:
     def _refuse_ended(self, verb: str) -> None:
         if not self.is_flying:
             raise StartError(f"{verb}: {self.folder.name} has ended")
+
+
+def _numbers(agents: Agents) -> list[int]:
+    """Return the numbers of the agents asked; none: all."""
+    return [agents] if isinstance(agents, int) else list(agents or ())
+
+
+def _refuse_problems(replies: Sequence[Reply]) -> None:
+    """Check that every agent asked obeys.
+
+    Raises:
+        MissionError: one refuses, or is silent.
+    """
+    if problems := [reply.problem for reply in replies if reply.problem]:
+        raise MissionError("\n".join(problems))

@@ -50,15 +50,23 @@ def as_json(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes:
 
 
 def _drawn(lines: Sequence[Finding]) -> Table:
-    table = Table(*_COLUMNS)
-    before = None
+    """Return a table with a section for each vehicle, and one for what is the same of several of them."""
+    vehicles = {line.agent for line in lines} - {SWARM}
+    alike: dict[tuple[str, ...], list[int]] = {}
     for line in lines:
-        if before is not None and line.agent != before:
-            table.add_section()
-        first, *middle, verdict = _cells(line)
-        name = Text(first if line.agent != before else "")  # not markup: a vehicle's text may contain "[...]"
-        table.add_row(name, *map(Text, middle), Text(verdict, style=_STYLES[line.verdict]))
-        before = line.agent
+        alike.setdefault(_cells(line)[1:], []).append(line.agent)
+    sections: dict[str, dict[tuple[str, ...], Verdict]] = {}
+    for line in lines:
+        cells = _cells(line)[1:]
+        who = alike[cells]
+        name = "all" if len(who) > 1 and set(who) == vehicles else ", ".join(map(_who, who))
+        sections.setdefault(name, {})[cells] = line.verdict
+    table = Table(*_COLUMNS)
+    for name, rows in sections.items():
+        for number, ((*middle, verdict), judged) in enumerate(rows.items()):
+            first = Text("" if number else name)  # not markup: a vehicle's text may contain "[...]"
+            table.add_row(first, *map(Text, middle), Text(verdict, style=_STYLES[judged]))
+        table.add_section()
     return table
 
 

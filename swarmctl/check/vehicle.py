@@ -343,12 +343,15 @@ def _loss(facts: VehicleFacts, config: Config) -> Finding:
     else:
         verdict = NOTE if dropped else OK
         advice = "this computer was too busy to take all that arrived: fly with less beside it" if dropped else ""
+    failsafe = config.agent.failsafe
+    acts = ", ".join(failsafe.acts("link"))
     return Finding(
         agent=facts.agent,
         topic="loss",
         verdict=verdict,
-        found=f"{lost_01:.1%}" + (f", {dropped} dropped here" if dropped else ""),
-        wanted=", ".join([f"under {_LOSS_NOTE_01:.0%}", *config.agent.failsafe.acts("link")]),
+        found=f"{lost_01:.1%} on the way" + (f", {dropped} not taken by this computer" if dropped else ""),
+        wanted=f"under {_LOSS_NOTE_01:.0%}"
+        + (f"; in flight: {acts} of {failsafe.window_s:g} s without a new state" if acts else ""),
         advice=advice,
         weight=67,
     )

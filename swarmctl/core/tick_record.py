@@ -89,6 +89,7 @@ class Curve:
     is_count: bool = False  # it only grows: drawn in steps
     worst: Literal["largest", "smallest"] = "largest"  # value among agents
     is_slow: bool = False  # in the view its newest value is enough
+    is_share: bool = False  # the view draws it from 0 to 1, whatever its values are
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,7 +127,7 @@ _SOLVE = Curve(title="Solve time [ms]", where=lambda rows: rows["iterations"] > 
 _TICK = Curve(title="Tick time, listen to send [ms]")
 _MISSES = Curve(title="Deadline misses so far", is_count=True, is_slow=True)
 _STALENESS = Curve(title="Plan staleness, oldest of the peers' [ms]", page="swarm")
-_BATTERY = Curve(title="Battery [0..1]", page="swarm", worst="smallest", is_slow=True)
+_BATTERY = Curve(title="Battery [0..1]", page="swarm", worst="smallest", is_slow=True, is_share=True)
 _TYPES = "in `swarmctl/core/types.py`"
 
 COLUMNS = (

@@ -11,7 +11,7 @@ import math
 import struct
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import development as mavlink
@@ -46,6 +46,14 @@ _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
 _HOVER_M_S = 0.2
 _MOST_PARAMETERS = 5000  # an autopilot has some 1500
+_MOST_TEXTS = 20  # that wait to be read
+
+
+class AutopilotText(NamedTuple):
+    """A message of the autopilot to its operator."""
+
+    severity: int  # MAV_SEVERITY, from 0 (emergency) to 7 (debug)
+    text: str
 
 
 class Autopilot:
@@ -104,7 +112,7 @@ class Autopilot:
         self._slow: CommandPort | None = None
         self.dialect: Dialect | None = None
         self.armed, self.armed_told_us = False, -1
-        self.texts: list[str] = []
+        self._texts: deque[AutopilotText] = deque(maxlen=_MOST_TEXTS)
         self.refused_setpoints = self.samples = 0
         self.received_us: int | None = None
         self.invalid: Counter[str] = Counter()
@@ -257,7 +265,11 @@ class Autopilot:
 
     def _statustext(self, message: Any, arrived_us: int) -> None:
         text = message.text.rstrip("\t\x00") if isinstance(message.text, str) else str(message.text)
-        self.texts = [*self.texts[-19:], printable(text)]
+        self._texts.append(AutopilotText(int(message.severity), printable(text)))
+
+    def next_text(self) -> AutopilotText | None:
+        """Return the oldest message of the autopilot that was not returned yet; of many, the newest are kept."""
+        return self._texts.popleft() if self._texts else None
 
     # -- state --------------------------------------------------------------------------------------------------------
 

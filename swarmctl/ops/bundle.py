@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from swarmctl import __version__
 from swarmctl.bus.peers import agent_name
@@ -33,6 +33,8 @@ from swarmctl.process_lifetime import StopRequest
 if TYPE_CHECKING:
     from swarmctl.check.ground_services import GroundVehicle
 
+_SIMULATED = "the built-in simulator has ended, and keeps no logs"
+_SIGNED = "it signs its link, and a bundle reads no key file that a run folder names; take its logs by a ground station"
 _CONNECT_S, _LISTEN_S, _LONGER_S = 5.0, 1.0, 10.0
 _PACKAGES = ("numpy", "scipy", "osqp", "pymavlink", "mavsdk", "eclipse-zenoh", "msgspec", "pyarrow", "rerun-sdk")
 
@@ -47,15 +49,21 @@ class BundleOptions:
     longest_s: float = 300.0  # time for each log
 
 
-def bundle(options: BundleOptions) -> Path:
-    """Write the archive and return its path. What can't be had from a vehicle is named in `vehicles.json`.
+class Bundle(NamedTuple):
+    """A written archive, and of which vehicles it holds no logs."""
+
+    path: Path
+    problems: Mapping[str, str]  # by agent, why; as in its `vehicles.json`
+
+
+def bundle(options: BundleOptions) -> Bundle:
+    """Write the archive. What can't be had from a vehicle is named in `vehicles.json`.
 
     Raises:
         ConfigError: it is no run folder.
         StartError: the archive can't be written.
     """
     config, folder = load_recorded(options.folder), options.folder.resolve()
-    config = config.model_copy(update={"mavlink": MavlinkParams()})  # what a received folder names is not read
     output = options.output or folder.with_name(f"{folder.name}.zip")
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)
     try:
@@ -71,14 +79,22 @@ def bundle(options: BundleOptions) -> Path:
                     archive.write(path, Path("logs") / path.name)
     except OSError as error:
         raise StartError(f"{output}: can't be written: {error}. Choose another with --output") from error
-    return output
+    return Bundle(output, {agent: told["problem"] for agent, told in vehicles.items() if "problem" in told})
+
+
+def lines_of(bundled: Bundle) -> list[str]:
+    """Return the path of the archive, and a line for each reason why logs are missing."""
+    agents: dict[str, list[str]] = {}
+    for agent, why in bundled.problems.items():
+        agents.setdefault(why, []).append(agent)
+    return [str(bundled.path), *(f"no logs of {', '.join(names)}: {why}" for why, names in agents.items())]
 
 
 def _vehicles(config: Config, options: BundleOptions, scratch: Path) -> dict[str, dict[str, Any]]:
     """Download into `scratch`, and return by agent what each vehicle stores, or why it is not known."""
-    if config.sitl.enabled:
-        why = "the built-in simulator has ended, and keeps no logs"
+    if why := _SIMULATED if config.sitl.enabled else _SIGNED if config.mavlink.signing_keys else "":
         return {agent_name(agent): {"problem": why} for agent in range(config.swarm.agents)}
+    config = config.model_copy(update={"mavlink": MavlinkParams()})  # what a received folder names is not read
     with open_links(config, _CONNECT_S) as opened:
         scans = opened.scans(config, _LISTEN_S)
         run_scans(list(scans.values()), _CONNECT_S, _CONNECT_S + _LONGER_S, opened.ended)

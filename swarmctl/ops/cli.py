@@ -24,7 +24,7 @@ from swarmctl.ops.verbs.hosts import add_host_verbs
 from swarmctl.ops.verbs.keys import keys_app
 from swarmctl.ops.verbs.mission import mission_app
 from swarmctl.ops.verbs.obstacles import obstacle_app
-from swarmctl.ops.verbs.orders import Run, add_order_verbs
+from swarmctl.ops.verbs.orders import AsJson, Run, add_order_verbs
 
 if TYPE_CHECKING:
     from swarmctl.bus.json_messages import StatusMessage
@@ -51,6 +51,9 @@ Set = Annotated[
 ]
 NewRunDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder to create; default runs/<UTC>-<name>.")]
 View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")]
+WebPage = Annotated[
+    bool, typer.Option("--web", help="Serve the view to browsers of this computer; no window, unless --view.")
+]
 _WATCH_S = 0.25
 # The verb's module declares the options, and answers --help.
 _PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
@@ -107,6 +110,7 @@ def launch(
     seed: Seed = None,
     sets: Set = None,
     view: View = None,
+    web: WebPage = False,
 ) -> int:
     """Start simulator, agents, bus and view, and fly. Ctrl-C lands; a second Ctrl-C kills every process."""
     from swarmctl.config import load
@@ -114,7 +118,7 @@ def launch(
     from swarmctl.ops.launch import launch as fly
     from swarmctl.telemetry.view.recordings import has_display
 
-    options = LaunchOptions(run_dir, has_display() if view is None else view)
+    options = LaunchOptions(run_dir, has_display() and not web if view is None else view, web)
     return fly(load(config, _overrides(agents, duration, seed, sets)), options)
 
 
@@ -193,7 +197,7 @@ def agent(
     ] = False,
     identity: Annotated[str, typer.Option("--identity", help="Host it speaks for, one of [[hosts]].")] = "",
 ) -> int:
-    """Run one agent for one autopilot. `launch` starts agents; on a companion computer start it yourself."""
+    """Run one agent, whose vehicle and bus are there already. `launch` and `host` start agents."""
     from swarmctl.agent.runner import AgentProcess, run_agent
     from swarmctl.process_lifetime import PARENT_ENV, die_with_parent
 
@@ -275,15 +279,20 @@ def fault(
     ] = "both",
     towards: Annotated[float, typer.Option("--towards", help="Direction of a gust or jump [deg from north].")] = 0.0,
     run: Run = None,
+    as_json: AsJson = False,
 ) -> int:
     """Inject a fault into the simulator of a running launch. Refused where real vehicles fly."""
+    from swarmctl.ops import fault as faults
     from swarmctl.ops import operator
-    from swarmctl.ops.fault import inject, parse_fault
 
     launch = operator.find_launch(run)
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
-    asked = parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
-    print(f"fault: {launch.run}\n{inject(launch, asked)}")
+    asked = faults.parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
+    since_boot_s = faults.inject(launch, asked)
+    if as_json:
+        print(faults.as_json(launch.run, asked, since_boot_s))
+    else:
+        print(f"fault: {launch.run}\n{faults.line_of(asked, since_boot_s)}")
     return EXIT_OK
 
 
@@ -319,6 +328,12 @@ def bench(context: typer.Context) -> NoReturn:
 def sweep(context: typer.Context) -> NoReturn:
     """Fly every combination of values in lockstep, on all processors. Writes a table and charts; can be resumed."""
     _become("sitl.studies.sweep.command", context.args)
+
+
+@app.command(context_settings=_PASS_ON)
+def campaign(context: typer.Context) -> NoReturn:
+    """Fly seeded Monte Carlo campaigns in lockstep, and count collisions and arrivals. Can be resumed."""
+    _become("sitl.studies.campaign.command", context.args)
 
 
 def _become(module: str, arguments: list[str]) -> NoReturn:

@@ -27,6 +27,7 @@ def export_mcap(directory: Path, output: Path | None) -> Path:
         run=judged.run,
         plans={agent: read_plans(directory, agent) for agent in judged.run.ticks},
         flight=viewed_flight(config),
+        obstacles=judged.rules.obstacles,
         config_toml=judged.config_text,
         summary_json=json.dumps(judged.summary, indent=2),
     )

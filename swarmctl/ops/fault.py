@@ -43,8 +43,8 @@ def parse_fault(wanted: Mapping[str, Any], vehicles: int) -> FaultParams:
     return fault
 
 
-def inject(launch: RunningLaunch, fault: FaultParams) -> str:
-    """Send a fault to the simulator of a launch and return its answer.
+def inject(launch: RunningLaunch, fault: FaultParams) -> float:
+    """Send a fault to the simulator of a launch; returns when it began, since the simulator's start [s].
 
     Raises:
         ConfigError: the launch does not simulate its vehicles, or the simulator refuses the fault.
@@ -59,9 +59,19 @@ def inject(launch: RunningLaunch, fault: FaultParams) -> str:
     answer = _ask(path, {"fault": fault.model_dump()})
     if not answer.get("ok"):
         raise ConfigError("fault", [str(problem) for problem in answer.get("problems", ["refused"])])
+    return float(answer["since_boot_s"])
+
+
+def line_of(fault: FaultParams, since_boot_s: float) -> str:
+    """Return what was injected, and when, in words."""
     who = "every vehicle" if fault.vehicle < 0 else f"vehicle {fault.vehicle}"
     length = f" for {fault.for_s:g} s" if fault.for_s else ""
-    return f"{fault.kind} on {who}{length}, {answer['since_boot_s']:.1f} s after the simulator's start"
+    return f"{fault.kind} on {who}{length}, {since_boot_s:.1f} s after the simulator's start"
+
+
+def as_json(run: str, fault: FaultParams, since_boot_s: float) -> str:
+    """Return the same for programs."""
+    return json.dumps({"run": run, **fault.model_dump(), "since_boot_s": since_boot_s}, indent=2)
 
 
 def _ask(path: Path, request: dict[str, Any]) -> dict[str, Any]:

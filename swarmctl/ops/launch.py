@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from swarmctl import __version__
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.router_links import RouterLinks
 from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
@@ -22,7 +23,7 @@ from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import OBSTACLES, OPERATOR, STATUS, TICK, Topic
 from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, socket_file
 from swarmctl.config import Config, dump
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text
 from swarmctl.ops.operator import RunningLaunch, announce, list_keepers, process_start_s, utc_us, withdraw
 from swarmctl.ops.preflight import LOOPBACK, ReservedPorts, inspect
@@ -59,6 +60,7 @@ class LaunchOptions:
 
     run_dir: Path | None = None
     view: bool = False  # open the viewer window
+    web: bool = False  # serve the view to browsers of this computer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,6 +110,8 @@ def started(config: Config, options: LaunchOptions, part: SwarmPart) -> Iterator
     Raises:
         ConfigError, StartError: it was refused, or did not come up; nothing is left running.
     """
+    if options.web and not config.telemetry.enabled:
+        raise ConfigError("--web", ["telemetry.enabled = false: there is no view"])
     reserved = inspect(config, part.agents)
     try:
         directory = _run_folder(config, options)
@@ -170,7 +174,8 @@ class Launcher(Services):
         self._spawn(router_command(config, context, self._links))
         self.bus = self._join_bus()
         if reserved.view_port:
-            self._spawn(viewer_command(config, context, reserved.view_port, self._options.view))
+            options = self._options
+            self._spawn(viewer_command(config, context, reserved.view_port, view=options.view, web=options.web))
         if config.sitl.enabled and context.agents:
             self._spawn(sitl_command(config, context, reserved.ports, reserved.vehicle_sockets))
         for command in agent_commands(config, context, reserved.sockets, reserved.vehicle_sockets):
@@ -180,7 +185,12 @@ class Launcher(Services):
             self.display.print_line(line)
         realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
         self.log.write(
-            "started", run=context.run, agents=list(context.agents), ports=list(reserved.ports), realtime=realtime
+            "started",
+            run=context.run,
+            version=__version__,
+            agents=list(context.agents),
+            ports=list(reserved.ports),
+            realtime=realtime,
         )
 
     @property
@@ -193,6 +203,11 @@ class Launcher(Services):
         if self.bus is None:
             raise StartError("the bus is not up")
         return self.bus
+
+    def tell(self, event: str, text: str, **fields: str) -> None:
+        """Record an event, and show its text."""
+        self.log.write(event, text=text, **fields)
+        self.display.print_line(text)
 
     def restart_router(self) -> None:
         """Start the router again where the ended one was; everybody's session finds it by itself."""
@@ -241,6 +256,7 @@ class Launcher(Services):
                 str(context.directory),
                 view,
                 context.identity,
+                __version__,
             )
         )
 
@@ -283,7 +299,7 @@ def _introduction(config: Config, context: RunContext, reserved: ReservedPorts) 
         vehicles = f"built-in SITL ({config.sitl.preset}) on {LOOPBACK}"
     else:
         vehicles = ", ".join(config.vehicles[agent].url for agent in context.agents)
-    view = f"view on port {reserved.view_port}" if reserved.view_port else "no view"
+    view = "the view's address follows" if reserved.view_port else "no view"
     return (
         f"{context.run}: {agents}{of} agent{'s' if config.swarm.agents > 1 else ''}, {vehicles}",
         f"bus {context.endpoint}; {view}",

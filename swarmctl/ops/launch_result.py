@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
-from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 
 
 @dataclass(slots=True, kw_only=True)
@@ -17,7 +16,6 @@ class LaunchResult:
     has_armed: bool = False  # an agent has requested arming
     left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
     interrupted: bool = False
-    obstacles: tuple[JudgedObstacle, ...] | None = None  # all there were; None: as configured
 
     @property
     def outcome(self) -> str:

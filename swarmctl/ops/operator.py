@@ -48,6 +48,7 @@ class RunningLaunch(msgspec.Struct, frozen=True):
     run_dir: str
     view: str = ""  # address of the live view; "" without one
     identity: OwnIdentity | None = None  # as which operators speak here; None: a launch on one computer
+    version: str = ""  # of the swarmctl that flies
 
 
 def announce(launch: RunningLaunch) -> None:

@@ -10,6 +10,7 @@ import secrets
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from swarmctl.bus.json_messages import StatusMessage, decode_answer, decode_status
 from swarmctl.bus.orders import EVERYBODY, order_messages
@@ -52,6 +53,15 @@ class Reply:
         """Return one line for the operator."""
         where = "" if self.phase is None else f", {self.phase.name}"
         return self.problem or f"{agent_name(self.agent)} accepts{where}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the same for programs; `accepted` is None of an agent that was silent."""
+        return {
+            "agent": self.agent,
+            "accepted": None if self.answer is None else self.answer.accepted,
+            "phase": None if self.phase is None else self.phase.name,
+            "problem": self.problem,
+        }
 
 
 def numbered(order: Order) -> Order:

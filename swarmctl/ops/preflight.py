@@ -29,6 +29,7 @@ _NEEDED = {
     "msgspec": (0, 19),
     "pyarrow": (18,),
 }
+_SERIAL_PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "serial[0-9]*")  # adapters, USB, UARTs of companions
 _NEEDED_TO_VIEW = {"rerun-sdk": (0, 41)}
 
 
@@ -105,6 +106,10 @@ def _package_problems(config: Config) -> Iterator[str]:
             yield f"package {name} = {found}: too old; pip install '{name}>={wanted}'"
 
 
+def _serial_ports() -> list[str]:
+    return sorted({str(path) for pattern in _SERIAL_PORTS for path in Path("/dev").glob(pattern)})
+
+
 def _vehicle_problems(config: Config, agents: Sequence[int]) -> Iterator[str]:
     for agent in agents:
         vehicle = config.vehicles[agent]
@@ -113,7 +118,7 @@ def _vehicle_problems(config: Config, agents: Sequence[int]) -> Iterator[str]:
         if endpoint.scheme == "serial":
             device = Path(endpoint.where)
             if not device.exists():
-                here = ", ".join(sorted(str(p) for p in Path("/dev").glob("tty[UA][SC][BM]*"))) or "none"
+                here = ", ".join(_serial_ports()) or "none that is known by its name"
                 yield f"{key}: {endpoint.where} does not exist; serial ports here: {here}"
             elif not os.access(device, os.R_OK | os.W_OK):
                 yield f"{key}: no permission to read and write; join the group that owns {endpoint.where}"

@@ -131,13 +131,13 @@ def control_socket(endpoint: str) -> Path:
     return socket_file(endpoint).with_name("sitl.sock")
 
 
-def viewer_command(config: Config, context: RunContext, port: int, view: bool) -> Command:
-    """Return the command of the viewer process, which owns rerun."""
+def viewer_command(config: Config, context: RunContext, port: int, *, view: bool, web: bool) -> Command:
+    """Return the command of the viewer process, which owns rerun; it may open a window, and serve a page."""
     argv = _python("-m", "swarmctl.telemetry.view.viewer", "--run", context.run, "--bus", context.endpoint)
     argv += ("--flight", viewed_flight(config).model_dump_json(), "--run-dir", f"{context.directory}")
     argv += ("--port", f"{port}", "--rate-hz", f"{config.telemetry.rate_hz!r}", "--die-with-parent")
     argv += () if context.identity is None else ("--identity", context.identity.as_json())
-    return Command(VIEWER, argv + (("--view",) if view else ()))
+    return Command(VIEWER, argv + (("--view",) if view else ()) + (("--web",) if web else ()))
 
 
 def _priority_flag(config: Config, context: RunContext) -> str:
@@ -153,7 +153,7 @@ class Child:
     """A started process. Start it from the main thread: the kernel ties its life to the thread that did."""
 
     def __init__(self, command: Command, directory: Path) -> None:
-        self.name = command.name
+        self.name, self.argv = command.name, command.argv
         self.log = directory / f"{command.name}.log"
         self.ended_s: float | None = None
         try:

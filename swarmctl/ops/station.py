@@ -11,10 +11,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from swarmctl.bus.json_messages import decode_obstacles
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.topics import TICK
+from swarmctl.bus.topics import OBSTACLES, TICK
 from swarmctl.config import Config, own_identity
 from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.records import unpack_tick
@@ -24,10 +25,12 @@ from swarmctl.ops.bus_report import BusReport
 from swarmctl.ops.host import refuse_unidentified, shared_run_name
 from swarmctl.ops.launch import LaunchOptions, SwarmPart, started
 from swarmctl.ops.launch_result import LaunchResult
-from swarmctl.ops.processes import ROUTER
+from swarmctl.ops.processes import ROUTER, VIEWER
 from swarmctl.ops.status_table import AgentView, Display
 from swarmctl.ops.summary import sum_up
+from swarmctl.ops.viewer_watch import ViewerWatch
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.recorder import Recorder
 
 _STEP_S = 0.05
@@ -54,8 +57,10 @@ def run_station(config: Config, options: LaunchOptions) -> int:
                 services.display,
                 note=services.log.write,
             )
+            viewer = ViewerWatch(services.children.get(VIEWER), services.tell, services.announce)
             router = services.children[ROUTER]
             while not (stop.count or watch.step()):
+                viewer.step()
                 if router.poll() is not None:
                     watch.problems.append(f"router {router.how_it_ended()}; see {router.log}. The swarm flies on")
                     break
@@ -76,7 +81,7 @@ class SwarmWatch:
         agents: size of the swarm.
         directory: run folder for what they report.
         display: shows them.
-        note: is told of refused messages, see `Refusals`.
+        note: is told of refused messages, see `Refusals`, and of lists of obstacles.
         clock_s: monotonic time [s].
 
     Attributes:
@@ -94,7 +99,8 @@ class SwarmWatch:
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bus, self._display, self._clock_s = bus, display, clock_s
-        self._report = BusReport(bus, note, display)
+        self._report, self._note = BusReport(bus, note, display), note
+        self._obstacles_version: int | None = None
         self._views = [AgentView(agent=agent) for agent in range(agents)]
         self._recorders = {agent_name(agent): Recorder(directory, agent) for agent in range(agents)}
         self.problems: list[str] = []
@@ -111,6 +117,11 @@ class SwarmWatch:
             if 0 <= status.agent < len(self._views):
                 view = self._views[status.agent]
                 view.status, view.received_s = status, now_s
+        for _, payload in self._bus.receive(OBSTACLES):
+            message = decode_obstacles(payload)
+            if message is not None and message.replaces(self._obstacles_version):
+                self._obstacles_version = message.version
+                self._note("obstacles", **recorded_list(message))
         self._report.step()
         self._display.show(self._views)
         over = all(self._has_ended(view, now_s) for view in self._views)

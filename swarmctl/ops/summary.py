@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
 from swarmctl.mavlink.signing.refusals import HARMLESS
 from swarmctl.ops.launch_result import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
-
-if TYPE_CHECKING:
-    from swarmctl.telemetry.evaluation.referee import Rules
 
 
 def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Callable[[str], None]) -> bool:
@@ -26,10 +22,8 @@ def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Ca
     from swarmctl.telemetry.view.recordings import optimize_recording  # heavy
 
     try:
-        rules = _rules(config, result)
-        summary, unwritten = finish_run(
-            directory, rules, Outcome(outcome=result.outcome, problems=tuple(result.problems))
-        )
+        outcome = Outcome(outcome=result.outcome, problems=tuple(result.problems))
+        summary, unwritten = finish_run(directory, config.rules(), outcome)
     except Exception as error:
         known = {"outcome": result.outcome, "violations": list(result.problems)}
         for line in (*violation_lines(known), *summary_lines(known, directory)):
@@ -65,15 +59,15 @@ def rewrite_report(directory: Path) -> Path:
     return report_run(directory, load_recorded(directory).rules())
 
 
-def write_figures(directory: Path) -> Path:
-    """Write every figure of a run folder as an SVG file and return the folder they are in.
+def write_figures(directory: Path, *, png: bool) -> Path:
+    """Write every figure of a run folder as an SVG file, and as PNG too, and return the folder they are in.
 
     Raises:
         ConfigError: it is no folder of a finished run.
     """
     from swarmctl.telemetry.recording.run_folder import write_run_figures  # heavy
 
-    return write_run_figures(directory, load_recorded(directory).rules())
+    return write_run_figures(directory, load_recorded(directory).rules(), png=png)
 
 
 def compare(directories: Sequence[Path], output: Path | None) -> Path:
@@ -89,16 +83,10 @@ def compare(directories: Sequence[Path], output: Path | None) -> Path:
     return compare_runs(output or directories[-1].resolve().parent / f"{names}.html", runs)
 
 
-def _rules(config: Config, result: LaunchResult) -> Rules:
-    """Return the limits of the configuration, with obstacles as an operator left them."""
-    rules = config.rules()
-    return rules if result.obstacles is None else replace(rules, obstacles=result.obstacles)
-
-
 def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:
     """Return five lines: outcome, separation, timing, solver and bus, folder."""
     violations = summary.get("violations") or []
-    separation, obstacles = _section(summary, "separation"), _section(summary, "obstacles")
+    obstacles = _section(summary, "obstacles")
     timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
     tick, solve, age = _section(timing, "tick_ms"), _section(timing, "solve_ms"), _section(comms, "path_age_ms")
     rejected = sum(_section(comms, "rejected").values())
@@ -111,7 +99,7 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
     clearance = obstacles.get("min_clearance_m")
     return (
         outcome,
-        f"separation {_m(separation.get('min_m'))} (required {_m(separation.get('required_m'))})"
+        _separation(summary)
         + (
             f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else ""
         ),
@@ -125,6 +113,13 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         + _deadlocks(summary),
         f"run folder {directory}",
     )
+
+
+def _separation(summary: Mapping[str, Any]) -> str:
+    found = _section(summary, "separation")
+    if summary.get("agents") == 1:
+        return "no other agent"
+    return f"separation {_m(found.get('min_m'))} (required {_m(found.get('required_m'))})"
 
 
 def _refused_frames(comms: Mapping[str, Any]) -> str:

@@ -26,7 +26,9 @@ from swarmctl.ops.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.status_table import AgentView, Display, name_of
+from swarmctl.ops.viewer_watch import ViewerWatch
 from swarmctl.telemetry.recording.event_log import EventLog
+from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 
 _STEP_S = 0.05
 _FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
@@ -73,6 +75,7 @@ class FlightSupervisor:
         self._bus: Bus = services.bus
         self._display = display
         self._result = LaunchResult()
+        self._viewer_watch = ViewerWatch(services.children.get(VIEWER), self._announce, services.announce)
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
         self._obstacles = ObstacleKeeper(self._bus, config.obstacles)
         self._report = BusReport(self._bus, services.log.write, display)
@@ -94,11 +97,14 @@ class FlightSupervisor:
         Args:
             interrupts: number of stop requests; the first lands all agents, the second kills all processes.
         """
+        if configured := self._obstacles.newest.obstacles:
+            text = f"{len(configured)} obstacles, as configured"
+            self._services.log.write("obstacles", text=text, **recorded_list(self._obstacles.newest))
         while interrupts() < 2:
             self._excuse_own_pause()
             self._receive()
             self._watch_essential_processes()
-            self._watch_viewer()
+            self._viewer_watch.step()
             self._watch_agents()
             self._watch_time()
             if interrupts() and not self._result.interrupted:
@@ -119,8 +125,7 @@ class FlightSupervisor:
         return self._report_left_vehicles()
 
     def _report_left_vehicles(self) -> LaunchResult:
-        """Report every vehicle that is not known to be on the ground, and the obstacles that there were."""
-        self._result.obstacles = self._obstacles.judged
+        """Report every vehicle that is not known to be on the ground."""
         self._result.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
         for words in self._result.left:
             self._fail("vehicle_left", words)
@@ -149,7 +154,7 @@ class FlightSupervisor:
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         for message in self._obstacles.receive():
             text = f"{len(message.obstacles)} obstacles, set by an operator"
-            self._announce("obstacles", text, version=message.version)
+            self._announce("obstacles", text, **recorded_list(message))
         self._report.step()
 
     def _watch_essential_processes(self) -> None:
@@ -170,24 +175,6 @@ class FlightSupervisor:
                 self._result.could_not_start |= not any(view.status for view in self._views)
                 self._fail(f"{name}_ended", f"{name} {child.how_it_ended()}; landing. See {child.log}")
                 self._land(land_s)
-
-    def _watch_viewer(self) -> None:
-        child = self._services.children.get(VIEWER)
-        if child is None:
-            return
-        if child.poll() is not None:
-            if self._is_first(VIEWER):
-                self._announce(
-                    "viewer_ended", f"view and recording stopped: viewer {child.how_it_ended()}; the flight goes on"
-                )
-        elif "view address" not in self._reported:
-            line = child.line_with("viewer rerun+")
-            if line and self._is_first("view address"):
-                address = line.removeprefix("viewer ")
-                self._announce("viewer_ready", f"view {address}", url=address)
-                self._services.announce(address)
-        elif child.is_stopped() and self._is_first("viewer stopped"):
-            self._announce("viewer_frozen", "viewer is frozen; the flight goes on")
 
     def _watch_agents(self) -> None:
         now_s = time.monotonic()

@@ -24,7 +24,7 @@ from sitl.studies.campaign.trials import Cell, Row, Trial, trial_of
 from swarmctl.core.types import Phase
 
 ROOT = Path(__file__).parents[2]
-SHOWN = "    python tools/campaign.py "
+SHOWN = "    swarmctl campaign "
 TOUCH_M = {"swap": 0.48, "random": 0.15}
 
 
@@ -39,7 +39,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("campaign")
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
     (line,) = (line for page in pages for line in page.read_text().splitlines() if line.startswith(SHOWN))
-    command = [sys.executable, *shlex.split(line)[1:], "--out", str(out)]
+    command = [sys.executable, "-m", *shlex.split(line), "--out", str(out)]
     assert subprocess.run(command, cwd=ROOT, check=False).returncode == 0
     return out
 
@@ -108,7 +108,7 @@ def test_scenario_events_happen_in_flight() -> None:
 @pytest.mark.process
 def test_a_killed_campaign_resumes(tmp_path: Path) -> None:
     asked = ["--scenario", "swap", "--agents", "2", "--protections", "off", "--jobs", "2", "--out", str(tmp_path)]
-    command = [sys.executable, str(ROOT / "tools" / "campaign.py"), *asked, "--trials", "50"]
+    command = [sys.executable, "-m", "swarmctl", "campaign", *asked, "--trials", "50"]
     campaign = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
     children: list[psutil.Process] = []
     try:

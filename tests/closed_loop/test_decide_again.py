@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from sitl.lockstep import Lockstep
 from sitl.simulate import simulate
 from swarmctl.config import load
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import ConfigError
 from swarmctl.ops.decide.verb import decisions_of_run, lines_of
 from tests.closed_loop.conftest import mission_t_s
@@ -25,17 +27,22 @@ CROSSING = (
     "sitl.estimator=external",
     "obstacles=[{center_ned_m=[2,1.5,-3],radius_m=0.5,keep_out_m=1.0,visibility_m=5.0}]",
 )
+IN_THE_WAY = Obstacle(center_ned_m=(3.0, -1.0, -3.0), radius_m=0.4, keep_out_m=0.9, visibility_m=5.0)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Fly two agents past each other and an obstacle; one is held on the way and goes on."""
+    """Fly two agents past each other and obstacles, of which one is set meanwhile; one agent is held and goes on."""
     directory, step = tmp_path_factory.mktemp("run"), Lockstep.step
-    due = {2.0: "hold", 3.0: "resume"}
+    due: dict[float, Callable[[Lockstep], None]] = {
+        0.5: lambda flight: flight.set_obstacles([*flight.config.obstacles, IN_THE_WAY]),
+        2.0: lambda flight: flight.command("hold", 0),
+        3.0: lambda flight: flight.command("resume", 0),
+    }
 
     def ordering(self: Lockstep) -> None:
         for at_s in [at_s for at_s in due if mission_t_s(self) >= at_s]:
-            self.command(due.pop(at_s), 0)
+            due.pop(at_s)(self)
         step(self)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -71,6 +78,15 @@ def test_peers_are_heard(folder: Path, tmp_path: Path) -> None:
     (deaf / "agent-1.plans.parquet").unlink()
     first, _ = decisions_of_run(deaf, ())
     assert sum(found.ticks for found in first.differences) > 10
+
+
+def test_obstacles_that_were_set_in_flight_are_known(folder: Path, tmp_path: Path) -> None:
+    """Negative control: without the lists that agents have recorded, the one that was set is not avoided."""
+    bare = shutil.copytree(folder, tmp_path / "bare")
+    lines = (bare / "events.jsonl").read_text().splitlines(keepends=True)
+    assert sum('"obstacles_changed"' in line for line in lines) == 4, "two lists, of two agents"
+    (bare / "events.jsonl").write_text("".join(line for line in lines if '"obstacles_changed"' not in line))
+    assert sum(found.ticks for agent in decisions_of_run(bare, ()) for found in agent.differences) > 10
 
 
 def test_what_can_not_be_decided_again_is_refused(folder: Path, tmp_path: Path) -> None:

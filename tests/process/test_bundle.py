@@ -32,7 +32,8 @@ def run_folder(parent: Path, config: str) -> Path:
 
 def test_a_run_of_the_built_in_simulator_is_packed_without_asking_anybody(tmp_path: Path) -> None:
     done = bundle(run_folder(tmp_path, "[swarm]\nagents = 1\n"))
-    assert (done.returncode, done.stdout.strip()) == (0, str(tmp_path / "a-run.zip"))
+    why = "no logs of agent-0: the built-in simulator has ended, and keeps no logs"
+    assert (done.returncode, done.stdout) == (0, f"{tmp_path / 'a-run.zip'}\n{why}\n")
     with zipfile.ZipFile(tmp_path / "a-run.zip") as archive:
         files = ["a-run/agent-0.parquet", "a-run/config.toml", "vehicles.json", "versions.json"]
         assert sorted(archive.namelist()) == files, "a link may lead anywhere"
@@ -55,6 +56,14 @@ def test_what_can_not_be_had_from_a_vehicle_is_named(tmp_path: Path) -> None:
         assert told == {"agent-0": {"problem": "it tells no logs"}, "agent-1": {"problem": "nothing is heard"}}
     finally:
         simulator.stop()
+
+
+def test_of_vehicles_that_sign_it_says_that_it_has_no_logs_and_reads_no_key(tmp_path: Path) -> None:
+    vehicles = "".join(f'[[vehicles]]\nsysid={i}\nurl="udpin://127.0.0.1:{i}"\n' for i in (1, 2))
+    keys = '[mavlink]\nsigning_keys = ["/etc/shadow", "/etc/gshadow"]\n'
+    done = bundle(run_folder(tmp_path, f"[swarm]\nagents = 2\n[sitl]\nenabled = false\n{keys}{vehicles}"))
+    assert done.returncode == 0, done.stderr
+    assert "no logs of agent-0, agent-1: it signs its link, and a bundle reads no key file" in done.stdout
 
 
 def test_what_is_no_run_folder_is_refused(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ import psutil
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
+import swarmctl
 from swarmctl.config import load
 from swarmctl.core.types import Phase
 from swarmctl.mavlink.codec import Codec
@@ -396,6 +397,7 @@ def test_two_launches_at_once_beside_another_simulator(start: Start) -> None:
         others.terminate()
         others.wait(10)
     (one,), (other,) = first.events("started"), second.events("started")
+    assert one["version"] == other["version"] == swarmctl.__version__
     assert not set(one["ports"]) & set(other["ports"])
     assert one["run"] != other["run"]
 
@@ -451,9 +453,9 @@ def test_operator_verbs(
     file = tmp_path / "obstacles.toml"
     file.write_text("[[obstacles]]\ncenter_ned_m = [-40.0, 9.0, -9.0]\n")
     assert "1: sphere at -40.00, 9.00, -9.00" in verb("obstacle", "load", str(file)).stdout
-    moved = verb("obstacle", "move", "0", "--velocity", "-1,0,0")
+    moved = verb("obstacle", "move", "0", "--velocity", "-1,0,0", "--json")
     assert moved.returncode == 0, moved.stderr
-    assert "velocity -1.00, 0.00, 0.00 m/s" in moved.stdout
+    assert json.loads(moved.stdout)[0]["vel_ned_m_s"] == [-1.0, 0.0, 0.0]
     there = json.loads(verb("obstacle", "list", "--json").stdout)
     assert [item["number"] for item in there] == [0, 1]
     assert there[0]["center_ned_m"][0] < -40.0 and there[1]["center_ned_m"][0] == -40.0, "one of them moves"
@@ -467,7 +469,11 @@ def test_operator_verbs(
     assert nobody.returncode == 2
     assert re.findall(r"^hold: there is no agent \d; \S+ has agents 0 to 1$", nobody.stderr, re.MULTILINE)
     assert verb("exclude", "--peer", "2").returncode == 2
-    assert verb("resume").returncode == 0
+    resumed = json.loads(verb("resume", "--json").stdout)
+    assert [(reply["agent"], reply["accepted"], reply["phase"]) for reply in resumed["agents"]] == [
+        (0, True, "TRACK"),
+        (1, True, "TRACK"),
+    ]
     excluded = launched.verb("exclude", "--peer", "1")
     assert excluded.returncode == 0, excluded.stderr
     assert verb("exclude", "--peer", "255").returncode == 2

@@ -29,7 +29,10 @@ from swarmctl.ops.launch_result import LaunchResult
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
 from swarmctl.ops.status_table import AgentView
 from swarmctl.ops.supervisor import FlightSupervisor, Services
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 from swarmctl.telemetry.recording.event_log import EventLog
+from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
+from swarmctl.telemetry.recording.run_files import read_events
 from tests import builders
 
 pytestmark = pytest.mark.process
@@ -491,11 +494,11 @@ def test_obstacles_of_an_operator_are_adopted_and_repeated(tmp_path: Path) -> No
 
     scene.act = carry
     scene.join_as_operator()
-    result = scene.fly()
+    scene.fly()
     assert repeated[-1] == 6
-    assert result.obstacles is not None
-    assert [(judged.number, judged.obstacle) for judged in result.obstacles] == [(0, ball), (1, ball), (0, column)]
-    assert [judged.until_utc_us is None for judged in result.obstacles] == [False, False, True], (
-        "what is gone was there"
-    )
-    assert all(judged.since_utc_us == began_us for judged in result.obstacles)
+    configured = (JudgedObstacle(number=7, obstacle=ball),)
+    found = recorded_obstacles(configured, read_events(tmp_path))
+    assert [(judged.number, judged.obstacle) for judged in found] == [(0, ball), (1, ball), (0, column)]
+    assert [judged.until_utc_us is None for judged in found] == [False, False, True], "what is gone was there"
+    assert all(judged.since_utc_us == began_us for judged in found)
+    assert recorded_obstacles(configured, [{"event": "obstacles", "text": "1 obstacles"}]) == configured

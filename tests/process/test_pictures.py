@@ -67,7 +67,7 @@ def test_a_report_is_rendered_by_day_and_in_the_dark(
     shades = []
     for dark in (False, True):
         path = tmp_path / f"{dark}.png"
-        show_page(folder / "report.html", path, (800, 700), dark=dark)
+        show_page(folder / "report.html", path, (800, 1000), dark=dark)  # with the view from above
         image = np.asarray(Image.open(path).convert("RGB"))
         shades.append(float(np.median(image)))
         assert near(image, agent_rgb(0)) and near(image, agent_rgb(1)), "agents have the same colours in both"

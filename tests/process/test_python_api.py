@@ -27,6 +27,7 @@ SHORTER = {  # what flies is shortened, and the launch has nobody to look at it
     '"swarm.agents": 3': '"swarm.agents": 1, "sitl.start": "air"',
     '"mission.duration_s": 20.0': '"mission.duration_s": 3.0',
     "launch(config": f"launch(swarmctl.load(set={LAUNCHED})",
+    '"configs/examples/figure_8_mission.toml"': f'"{ROOT}/configs/examples/figure_8_mission.toml"',
     "    swarm.resume()\n": f"    swarm.resume()\n{EXAMPLE}",  # configs/examples/steer_swarm.py steers the same launch
 }
 
@@ -67,6 +68,8 @@ def test_an_order_was_obeyed_by_the_vehicle_and_the_launch_has_ended(flown: tupl
     run = swarmctl.load_run(flown[0] / "runs" / "second")
     obeyed = [event["verb"] for event in run.events if event["event"] == "operator"]
     steered = ["hold", "goto", "resume"]
-    assert obeyed[:7] == [*steered, *steered, "land"], "by the page, and by the example"
+    assert obeyed[:8] == [*steered, *steered, "mission", "land"], "by the page, and by the example"
+    (changed,) = (event for event in run.events if event["event"] == "mission_changed")
+    assert '"lemniscate"' in changed["mission"]
     assert run.true_states(0)["landed"][-1].as_py() == "ON_GROUND"
     assert run.ticks(0)["phase"][-1].as_py() == "DONE"

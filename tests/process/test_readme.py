@@ -39,7 +39,7 @@ SHOWN = [line.strip() for line in LINES if re.match(r"    (swarmctl|python3?) ",
 BIN = Path(sys.executable).parent
 WHILE_FLYING = (("status", "hold"), ("obstacle", "fault", "resume"), ("mission",), ("land",))  # near the start
 AFTERWARDS = ("report", "replay", "export")
-CAMPAIGN = r"^python tools/campaign\.py "  # is run by tests/closed_loop/test_campaign.py
+CAMPAIGN = r"^swarmctl campaign "  # is run by tests/closed_loop/test_campaign.py
 
 
 def shown(pattern: str) -> list[str]:

@@ -13,11 +13,14 @@ import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
+import psutil
 import pytest
 import zenoh
 
@@ -253,6 +256,22 @@ def test_comes_up_and_stops_without_agents(endpoint: str, tmp_path: Path) -> Non
         time.sleep(0.3)
         assert process.poll() is None  # Ctrl-C is the launcher's business
         assert finish(process) == "telemetry lost=0 received=0 malformed=0"
+
+
+def test_the_live_view_is_served_to_browsers_until_the_viewer_ends(endpoint: str, tmp_path: Path) -> None:
+    with viewer(endpoint, tmp_path, "--web") as process:
+        url = ready(process)
+        assert process.stdout is not None
+        page = process.stdout.readline().removeprefix("page ").strip()
+        assert parse_qs(urlsplit(page).query)["url"] == [url]
+        with urllib.request.urlopen(page, timeout=20) as answer:
+            assert b"web viewer" in answer.read()
+        (served,) = psutil.Process(process.pid).children()
+        assert {own.laddr.ip for own in served.net_connections("tcp") if own.status == psutil.CONN_LISTEN} == {
+            "127.0.0.1"
+        }
+        assert finish(process).startswith("telemetry lost=0")
+    assert not psutil.wait_procs([served], timeout=10)[1]
 
 
 def test_full_disk_leaves_the_live_view(endpoint: str, tmp_path: Path) -> None:

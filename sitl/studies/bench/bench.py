@@ -54,6 +54,7 @@ _READY_WITHIN_TICKS = 1500
 _OBSTACLE = ", 1 obstacle"
 _GUARANTEED = ", guaranteed"
 _GUARANTEED_NEIGHBOURS = 9  # neighbours in the scenario with commitments
+_PART_WIDTH, _CASE_WIDTH = 16, 21  # of columns in the terminal, with the room between them
 _ENDLESS_S = 3600.0
 _BUSY_LOAD = 0.7  # one-minute load average
 
@@ -222,19 +223,22 @@ def chosen_solvers(asked: Sequence[str]) -> tuple[list[str], str]:
 
 
 def show(rows: Sequence[BenchRow], console: Console) -> None:
-    """Print the rows as two tables and the ratios."""
-    neighbours = Column("neighbours", min_width=10)
-    table = Table("solver", neighbours, *PARTS, title="one tick: p50 (p99) [ms]", box=SIMPLE)
-    for suffix in ("", _GUARANTEED, _OBSTACLE):
-        keys = dict.fromkeys((r.neighbours, r.solver) for r in rows if r.name == "tick" + suffix)
-        for count, solver in keys:
-            found = {r.name: r for r in rows if (r.neighbours, r.solver) == (count, solver)}
-            cells = [f"{r.p50_ms:.2f} ({r.p99_ms:.2f})" for r in (found[name + suffix] for name in PARTS)]
-            table.add_row(solver, f"{count}{suffix}", *cells)
-    console.print(table)
+    """Print the rows as tables that fit the console, and the ratios."""
+    cases = {
+        f"{solver}, {count} neighbours{suffix}": _cells(rows, count, solver, suffix)
+        for suffix in ("", _GUARANTEED, _OBSTACLE)
+        for count, solver in dict.fromkeys((r.neighbours, r.solver) for r in rows if r.name == "tick" + suffix)
+    }
+    names, each = list(cases), max(1, (console.width - _PART_WIDTH) // _CASE_WIDTH)
+    console.print("one tick: p50 (p99) [ms]", markup=False)
+    for shown in (names[first : first + each] for first in range(0, len(names), each)):
+        table = Table("", *(Column(name, min_width=_CASE_WIDTH - 3, justify="right") for name in shown), box=SIMPLE)
+        for part, *cells in zip(PARTS, *(cases[name] for name in shown), strict=True):
+            table.add_row(part, *cells)
+        console.print(table)
     alone = [r for r in rows if r.name.startswith("solve x-y")]
-    title = "x-y problems of a flight, 2 neighbours + 1 obstacle [ms]"
-    table = Table("problem", "solver", "p50", "p99", title=title, box=SIMPLE)
+    console.print("x-y problems of a flight, 2 neighbours + 1 obstacle [ms]", markup=False)
+    table = Table("problem", "solver", "p50", "p99", box=SIMPLE)
     for r in alone:
         table.add_row(r.name.removesuffix(_OBSTACLE), r.solver, f"{r.p50_ms:.3f}", f"{r.p99_ms:.3f}")
     console.print(table)
@@ -244,6 +248,12 @@ def show(rows: Sequence[BenchRow], console: Console) -> None:
             console.print(
                 f"{r.solver}: {nonlinear.p50_ms / r.p50_ms:.0f} times as fast as slsqp, {name} (p50 of all problems)"
             )
+
+
+def _cells(rows: Sequence[BenchRow], count: int, solver: str, suffix: str) -> list[str]:
+    """Return what each part of a tick takes with so many neighbours."""
+    found = {r.name: r for r in rows if (r.neighbours, r.solver) == (count, solver)}
+    return [f"{r.p50_ms:.2f} ({r.p99_ms:.2f})" for r in (found[name + suffix] for name in PARTS)]
 
 
 def write(rows: Sequence[BenchRow], directory: Path) -> Path:

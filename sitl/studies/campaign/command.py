@@ -3,9 +3,9 @@
 Every combination is a cell, flown with the same seeds. Rows go to `OUT/rows.parquet` as they come in; the same call
 again flies only what is missing there. `OUT/report.html` has every cell with exact binomial intervals.
 
-    python tools/campaign.py --quick
-    python tools/campaign.py --scenario swap --agents 6,10 --delay 0,50,100 --loss 0,0.1 --trials 100 --out runs/swap
-    python tools/campaign.py --scenario random --protections default,off --dask scheduler.local:8786
+    swarmctl campaign --quick
+    swarmctl campaign --scenario swap --agents 6,10 --delay 0,50,100 --loss 0,0.1 --trials 100 --out runs/swap
+    swarmctl campaign --scenario random --protections default,off --dask scheduler.local:8786
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def _parser() -> argparse.ArgumentParser:
         for name, d in DISTURBANCES.items()
     )
     parser = argparse.ArgumentParser(
-        prog="campaign",
+        prog="swarmctl campaign",
         description=(__doc__ or "").rstrip(),
         epilog=f"scenarios:\n{scenarios}\n\ndisturbances:\n{disturbances}\n\nLists are separated by commas.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -200,3 +200,7 @@ def _numbers(kind: Callable[[str], _Value], low: float, high: float) -> Callable
         return values
 
     return parse
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -80,7 +80,7 @@ def again(row: Row) -> str:
     """Return the command that flies a row again."""
     sets = "".join(f" --set {item}" for item in row["sets"].split())
     return (
-        f"python tools/campaign.py --scenario {row['scenario']} --agents {row['agents']} --delay {row['delay_ms']:g} "
+        f"swarmctl campaign --scenario {row['scenario']} --agents {row['agents']} --delay {row['delay_ms']:g} "
         f"--loss {row['loss']:g} --noise {row['noise']} --wind {row['wind_m_s']:g} --protections {row['protections']} "
         f"--airframe {row['airframe']} --disturbance {row['disturbance']}{sets} --first-seed {row['seed']} --trials 1"
     )

@@ -69,7 +69,7 @@ def _chart(figure: Figure, axes: Sequence[Axis], across: int, found: Sequence[Co
     unit = f" [{figure.unit}]" if figure.unit else ""
     low, high = min(place.values()), max(place.values())
     shown = (low - _ROOM_01 * (high - low), high + _ROOM_01 * (high - low))
-    return time_chart(f"{figure.text}{unit} over {axis.key}{words}", lines, shown)
+    return time_chart(f"{figure.text}{unit} over {axis.key}{words}", lines, shown, x_unit="")
 
 
 def _others(axes: Sequence[Axis], across: int, one: Combination) -> str:

@@ -246,7 +246,7 @@ def index_chart(index: Sequence[IndexPoint]) -> Markup:
     lines.append(reference_line(radii, math.sqrt(3) * radii, bound, color=css(LIMIT_RGB), dash="5 4", width=1.2))
     shown = (float(radii[0]) - 0.03, float(radii[-1]) + 0.03)
     title = "Tracking index [m] over constraint radius [m], three periods of the circle"
-    return time_chart(title, lines, shown, from_zero=True, height=240)
+    return time_chart(title, lines, shown, from_zero=True, height=240, x_unit="m")
 
 
 def _tall_chart(

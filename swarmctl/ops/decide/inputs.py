@@ -1,7 +1,7 @@
 """What one agent has received in a recorded run, given to an agent again, tick by tick.
 
 Frames of its vehicle are those of the `.tlog`, paths of peers those of their `.plans`; statuses of peers follow from
-their ticks, orders from the events, obstacles from the configuration. What the agent sends goes nowhere.
+their ticks, orders and lists of obstacles from the events. What the agent sends goes nowhere.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from swarmctl.core.operator_verbs import MISSION, OPERATOR_VERBS
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, PredictedPath, VehicleState
 from swarmctl.mavlink.commands import OWN_COMPID
 from swarmctl.mavlink.transport import Datagram
+from swarmctl.telemetry.recording.run_files import utc_us_of
 
 Heard = tuple[int, Topic, str, bytes]  # UTC [us] of a message, its topic, sender and payload
 _STAMP = struct.Struct(">Q")  # UTC [us] before each frame of a .tlog
@@ -146,11 +147,23 @@ def peer_messages(
 def operator_messages(
     config: Config, agent: int, ticks: Mapping[int, NDArray[np.void]], events: Sequence[Mapping[str, Any]]
 ) -> list[Heard]:
-    """Return what the operator has said to an agent: the configured obstacles, and the orders that it has obeyed."""
-    begins_us = min(int(rows["utc_us"][0]) for rows in ticks.values())
-    listed = encode_message(first_list(config.obstacles, begins_us))
-    heard = [(begins_us, topics.OBSTACLES, OPERATOR, listed), *_orders(agent, events)]
+    """Return what the operator has said to an agent: obstacles, and the orders that it has obeyed.
+
+    A run that was recorded before lists of obstacles were has the configured ones.
+    """
+    own = [event for event in events if event.get("source") == agent_name(agent)]
+    heard = [*_orders(agent, own), *_obstacles(own)]
+    if not any(topic is topics.OBSTACLES for _, topic, _, _ in heard):
+        begins_us = min(int(rows["utc_us"][0]) for rows in ticks.values())
+        heard.append((begins_us, topics.OBSTACLES, OPERATOR, encode_message(first_list(config.obstacles, begins_us))))
     return sorted(heard, key=lambda message: message[0])
+
+
+def _obstacles(own: Sequence[Mapping[str, Any]]) -> Iterator[Heard]:
+    """Yield the lists of obstacles that an agent has taken over, from its events."""
+    for event in own:
+        if event.get("event") == "obstacles_changed" and isinstance(event.get("listed"), str):
+            yield utc_us_of(event), topics.OBSTACLES, OPERATOR, event["listed"].encode(errors="replace")
 
 
 def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np.void]) -> Iterator[Heard]:
@@ -250,9 +263,8 @@ def _ready_utc_us(rows: NDArray[np.void]) -> int:
     return int(ready[0]) if len(ready) else 0
 
 
-def _orders(agent: int, events: Sequence[Mapping[str, Any]]) -> Iterator[Heard]:
-    """Yield the orders that an agent has obeyed, and the missions that it was told of."""
-    own = [event for event in events if event.get("source") == agent_name(agent)]
+def _orders(agent: int, own: Sequence[Mapping[str, Any]]) -> Iterator[Heard]:
+    """Yield the orders that an agent has obeyed, and the missions that it was told of, from its events."""
     missions = [event for event in own if event.get("event") == "mission_changed"]
     for event in own:
         verb = event.get("verb")

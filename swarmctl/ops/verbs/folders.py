@@ -76,6 +76,9 @@ def report(
     figures: Annotated[
         bool, typer.Option("--figures", help="Also write every figure as an SVG file into figures/ of the folder.")
     ] = False,
+    png: Annotated[
+        bool, typer.Option("--png", help="The same, and as PNG, too. Needs: pip install 'swarmctl[png]'")
+    ] = False,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -87,15 +90,15 @@ def report(
     from swarmctl.ops.summary import compare, rewrite_report, write_figures
 
     if len(folders) > 1:
-        if figures:
+        if figures or png:
             raise ConfigError("--figures", ["the figures of one run are written at a time; give one run folder"])
         print(compare(folders, output))
         return EXIT_OK
     if output is not None:
         raise ConfigError("--output", ["only a page that compares runs is written elsewhere; give several folders"])
     print(rewrite_report(folders[0]))
-    if figures:
-        print(write_figures(folders[0]))
+    if figures or png:
+        print(write_figures(folders[0], png=png))
     return EXIT_OK
 
 
@@ -123,8 +126,8 @@ def bundle(
     logs: Annotated[int, typer.Option("--logs", min=0, help="Newest logs to download from each vehicle.")] = 1,
 ) -> int:
     """Pack a run for support: its folder, versions, and logs of the disarmed vehicles that are reached."""
-    from swarmctl.ops.bundle import BundleOptions
-    from swarmctl.ops.bundle import bundle as pack
+    from swarmctl.ops import bundle as packing
 
-    print(pack(BundleOptions(folder=folder, output=output, logs=logs)))
+    packed = packing.bundle(packing.BundleOptions(folder=folder, output=output, logs=logs))
+    print("\n".join(packing.lines_of(packed)))
     return EXIT_OK

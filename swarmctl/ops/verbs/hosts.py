@@ -50,6 +50,7 @@ def station(
     run_dir: _RunDir = None,
     sets: _Set = None,
     view: Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")] = None,
+    web: Annotated[bool, typer.Option("--web", help="Serve the view to browsers of this computer.")] = False,
 ) -> int:
     """Show, record, judge and steer a swarm of several hosts. Ctrl-C ends the station; the swarm flies on."""
     from swarmctl.config import load
@@ -57,5 +58,5 @@ def station(
     from swarmctl.ops.station import run_station
     from swarmctl.telemetry.view.recordings import has_display
 
-    options = LaunchOptions(run_dir, has_display() if view is None else view)
+    options = LaunchOptions(run_dir, has_display() and not web if view is None else view, web)
     return run_station(load(config, sets or (), only_agents=()), options)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from swarmctl.core.operator_verbs import MISSION
-from swarmctl.ops.verbs.orders import MoreAgents, Run, told
+from swarmctl.ops.verbs.orders import AsJson, MoreAgents, Run, told
 
 mission_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Change the mission of a running launch.")
 
@@ -23,6 +23,7 @@ def mission_set(
     file: Annotated[Path, typer.Argument(help="TOML file that holds [mission] alone, as a configuration does.")],
     agent: MoreAgents = None,
     run: Run = None,
+    as_json: AsJson = False,
 ) -> int:
     """Fly the mission of a file from now on: at once where one is flown, all at the same time; else when all are ready.
 
@@ -32,4 +33,4 @@ def mission_set(
     from swarmctl.ops.mission_file import set_mission
 
     launch = operator.find_launch(run)
-    return told(MISSION, launch.run, lambda: set_mission(launch, file, agent or []))
+    return told(MISSION, launch.run, lambda: set_mission(launch, file, agent or []), as_json=as_json)

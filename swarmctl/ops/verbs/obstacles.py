@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from swarmctl.errors import EXIT_OK
-from swarmctl.ops.verbs.orders import Run
+from swarmctl.ops.verbs.orders import AsJson, Run
 
 if TYPE_CHECKING:
     from swarmctl.bus.json_messages import ListedObstacle, ObstaclesMessage
@@ -25,17 +25,12 @@ File = Annotated[Path, typer.Argument(metavar="FILE", help="TOML file of [[obsta
 
 
 @obstacle_app.command("list")
-def obstacle_list(run: Run = None, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> int:
+def obstacle_list(run: Run = None, as_json: AsJson = False) -> int:
     """List the obstacles that the agents know: number, place now, sizes, velocity."""
     from swarmctl.ops import obstacle_list, operator
 
     launch = operator.find_launch(run)
-    known = obstacle_list.read_obstacles(launch)
-    if as_json:
-        print(obstacle_list.as_json(known))
-    else:
-        _show(launch.run, known)
-    return EXIT_OK
+    return _show(launch.run, obstacle_list.read_obstacles(launch), as_json)
 
 
 @obstacle_app.command("add")
@@ -51,13 +46,14 @@ def obstacle_add(
         bool, typer.Option("--column", help="A vertical column of unlimited height, not a sphere.")
     ] = False,
     run: Run = None,
+    as_json: AsJson = False,
 ) -> int:
     """Add a sphere or a column to a running launch."""
     from swarmctl.ops import obstacle_list
 
     keep_out_m = radius + 0.75 if keep_out is None else keep_out
     obstacle = obstacle_list.obstacle(center, radius, keep_out_m, visibility, velocity=velocity, column=column)
-    return _change(run, lambda known: obstacle_list.added(known, [obstacle]))
+    return _change(run, as_json, lambda known: obstacle_list.added(known, [obstacle]))
 
 
 @obstacle_app.command("move")
@@ -70,22 +66,24 @@ def obstacle_move(
         str | None, typer.Option("--velocity", metavar="N,E,D", help="New velocity [m/s]; default: as it moves.")
     ] = None,
     run: Run = None,
+    as_json: AsJson = False,
 ) -> int:
     """Put an obstacle elsewhere at once, or give it another velocity. Its number and sizes stay."""
     from swarmctl.ops import obstacle_list
 
-    return _change(run, lambda known: obstacle_list.moved(known, number, center, velocity))
+    return _change(run, as_json, lambda known: obstacle_list.moved(known, number, center, velocity))
 
 
 @obstacle_app.command("remove")
 def obstacle_remove(
     numbers: Annotated[list[int], typer.Argument(metavar="NUMBER...", help="Numbers in `obstacle list`.")],
     run: Run = None,
+    as_json: AsJson = False,
 ) -> int:
     """Remove obstacles from a running launch. The numbers of the others stay."""
     from swarmctl.ops import obstacle_list
 
-    return _change(run, lambda known: obstacle_list.removed(known, numbers))
+    return _change(run, as_json, lambda known: obstacle_list.removed(known, numbers))
 
 
 @obstacle_app.command("load")
@@ -93,6 +91,7 @@ def obstacle_load(
     file: File,
     replace: Annotated[bool, typer.Option("--replace", help="Remove all others; default: add to them.")] = False,
     run: Run = None,
+    as_json: AsJson = False,
 ) -> int:
     """Add the obstacles of a file to a running launch, at the places that it says."""
     from swarmctl.ops import obstacle_list
@@ -103,31 +102,36 @@ def obstacle_load(
         listed = obstacle_list.added(known, obstacles)
         return listed[len(known.obstacles) :] if replace else listed
 
-    return _change(run, change)
+    return _change(run, as_json, change)
 
 
 @obstacle_app.command("save")
 def obstacle_save(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file to create.")], run: Run = None
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file to create.")],
+    run: Run = None,
+    as_json: AsJson = False,
 ) -> int:
     """Write the obstacles of a running launch, as they are now, to a file that `load` and configurations take."""
     from swarmctl.ops import obstacle_list, operator
 
     known = obstacle_list.read_obstacles(operator.find_launch(run))
     obstacle_list.write_file(file, known)
-    print(f"{len(known.obstacles)} obstacles: {file}")
+    print(obstacle_list.as_json(known) if as_json else f"{len(known.obstacles)} obstacles: {file}")
     return EXIT_OK
 
 
-def _change(run: str | None, change: Callable[[ObstaclesMessage], Sequence[ListedObstacle]]) -> int:
+def _change(run: str | None, as_json: bool, change: Callable[[ObstaclesMessage], Sequence[ListedObstacle]]) -> int:
     from swarmctl.ops import obstacle_list, operator
 
     launch = operator.find_launch(run)
-    _show(launch.run, obstacle_list.change_obstacles(launch, change))
+    return _show(launch.run, obstacle_list.change_obstacles(launch, change), as_json)
+
+
+def _show(run: str, known: ObstaclesMessage, as_json: bool) -> int:
+    from swarmctl.ops import obstacle_list
+
+    if as_json:
+        print(obstacle_list.as_json(known))
+    else:
+        print("\n".join([f"obstacle: {run}", *obstacle_list.lines_of(known)]))
     return EXIT_OK
-
-
-def _show(run: str, known: ObstaclesMessage) -> None:
-    from swarmctl.ops.obstacle_list import lines_of
-
-    print("\n".join([f"obstacle: {run}", *lines_of(known)]))

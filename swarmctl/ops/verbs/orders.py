@@ -6,6 +6,7 @@ Heavy modules are imported inside the verb that needs them, as in `swarmctl.ops.
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -36,6 +37,7 @@ Run = Annotated[
 ]
 AskedAgents = Annotated[list[int] | None, typer.Argument(metavar="AGENT", help="Agents asked; default: all.")]
 MoreAgents = Annotated[list[int] | None, typer.Option("--agent", help="Agent asked, as an option; repeatable.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 _ANSWERS = "Exit code 0: every agent asked has accepted; 4: one has refused, or has not answered in time, and is named."
 
 
@@ -57,45 +59,56 @@ def _option_of(verb: str, name: str) -> Any:
     return _option(next(argument for argument in OPERATOR_VERBS[verb].arguments if argument.name == name))
 
 
-def _give(order: Order, run: str | None, agents: list[int]) -> int:
+def _give(order: Order, run: str | None, agents: list[int], as_json: bool) -> int:
     from swarmctl.ops import operator
     from swarmctl.ops.order_delivery import deliver
 
     launch = operator.find_launch(run)
-    return told(order.verb, launch.run, lambda: deliver(launch, order, agents))
+    return told(order.verb, launch.run, lambda: deliver(launch, order, agents), as_json=as_json)
 
 
-def told(verb: str, run: str, give: Callable[[], Sequence[Reply]]) -> int:
+def told(verb: str, run: str, give: Callable[[], Sequence[Reply]], *, as_json: bool = False) -> int:
     """Give an order to a launch, and print what each agent has answered; returns the exit code.
 
     Raises:
         MissionError: an agent refuses, or is silent.
     """
-    print(f"{verb}: {run}")
+    if not as_json:
+        print(f"{verb}: {run}")
     replies = give()
-    for reply in replies:
-        print(reply.line)
+    if as_json:
+        print(json.dumps({"run": run, "order": verb, "agents": [reply.as_dict() for reply in replies]}, indent=2))
+    else:
+        for reply in replies:
+            print(reply.line)
     if problems := [reply.problem for reply in replies if reply.problem]:
         raise MissionError(f"{verb}: {'; '.join(problems)}")
     return EXIT_OK
 
 
 def add_operator_verb(
-    to: typer.Typer, name: str, verb: OperatorVerb, give: Callable[[Order, str | None, list[int]], int] = _give
+    to: typer.Typer, name: str, verb: OperatorVerb, give: Callable[[Order, str | None, list[int], bool], int] = _give
 ) -> None:
     """Add a verb of the operator, with an option for each of its arguments.
 
     Args:
         to: command line to extend.
         name, verb: entry of `OPERATOR_VERBS`.
-        give: gives the order to a launch, to the agents named or to all; returns the exit code.
+        give: gives the order to a launch, to the agents named or to all, and prints the answers, as JSON or in words;
+            returns the exit code.
     """
 
-    def run(asked: AskedAgents = None, run: Run = None, agent: MoreAgents = None, **arguments: float | None) -> int:
+    def run(
+        asked: AskedAgents = None,
+        run: Run = None,
+        agent: MoreAgents = None,
+        as_json: AsJson = False,
+        **arguments: float | None,
+    ) -> int:
         given = {name: value for name, value in arguments.items() if value is not None}
-        return give(Order(name, given), run, [*(asked or ()), *(agent or ())])
+        return give(Order(name, given), run, [*(asked or ()), *(agent or ())], as_json)
 
-    parameters = list(inspect.signature(run, eval_str=True).parameters.values())[:3]
+    parameters = [*inspect.signature(run, eval_str=True).parameters.values()][:-1]
     for argument in verb.arguments:
         default = inspect.Parameter.empty if argument.required else None
         option = _option(argument)
@@ -113,6 +126,7 @@ def _goto(
     yaw: Annotated[float | None, _option_of(GOTO, YAW)] = None,
     speed: Annotated[float | None, _option_of(GOTO, SPEED)] = None,
     run: Run = None,
+    as_json: AsJson = False,
 ) -> int:
     from swarmctl.ops import operator
 
@@ -121,4 +135,4 @@ def _goto(
     arguments |= {name: value for name, value in ((YAW, yaw), (SPEED, speed)) if value is not None}
     if problem := "".join(problems) or order_problem(GOTO, arguments):
         raise ConfigError(GOTO, [problem])
-    return _give(Order(GOTO, arguments), run, [agent])
+    return _give(Order(GOTO, arguments), run, [agent], as_json)

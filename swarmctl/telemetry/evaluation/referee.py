@@ -284,7 +284,7 @@ def _evaluate_timing(
 
 
 def _evaluate_tracking(run: RunData, agents: int, steady_after_s: float) -> tuple[dict[str, Any], dict[int, float]]:
-    """Return tracking errors and, for each agent, the mission time it tracked [s].
+    """Return tracking errors and, for each agent, the time of its newest mission that it tracked [s].
 
     The index of thesis Table 19 is the summed mean tracking error: the sum over agents of the distance to the shared
     reference, averaged over the mission time common to all agents.
@@ -309,7 +309,7 @@ def _evaluate_tracking(run: RunData, agents: int, steady_after_s: float) -> tupl
         last_s = min(error.mission_t_s[-1] for error in errors.values())
         spans = [(first_s, last_s), (max(first_s, steady_after_s), last_s)]
         summed_m = (_summed_mean_error_m(errors, *spans[0]), _summed_mean_error_m(errors, *spans[1]))
-    tracked_s = {agent: float(error.mission_t_s[-1]) for agent, error in errors.items()}
+    tracked_s = {agent: error.tracked_s for agent, error in errors.items()}
     return {"index_m": summed_m[0], "index_after_10s_m": summed_m[1], "agents": rows}, tracked_s
 
 

@@ -16,6 +16,9 @@ from swarmctl.core.types import Array, Phase
 _GRID_US = 20_000
 _GAP_US = 500_000  # no interpolation between reported positions farther apart in time
 _STALE_MS = _GAP_US / 1e3  # an agent that receives nothing keeps recording the last known position
+_AGAIN_S = 0.5  # mission time that falls by more begins again; by less, somebody has set the clock
+_AT_REST_M = 0.01  # a reference that moves less in its last ticks has come to rest, and is a goal
+_LAST_TICKS = 10
 _SAME_M = 0.05  # references closer than this are the same
 _DIFFERENT_01 = 0.02  # fraction of the mission in which they may be apart all the same: at their steps
 MAX_RUN_US = 48 * 3_600_000_000  # longest run; clocks farther apart belong to different runs
@@ -34,9 +37,10 @@ class Tracks:
 class TrackError:
     """Tracking error of one agent, one row for each tick of the mission."""
 
-    mission_t_s: Array  # (T,)
+    mission_t_s: Array  # (T,) of all missions that were flown one after the other
     error_ned_m: Array  # (T, 3) position minus reference
     distance_m: Array  # (T,)
+    tracked_s: float  # time of the newest mission at the last of them
 
 
 def flight_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
@@ -49,6 +53,37 @@ def tracking_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
     """Return the ticks of the mission itself."""
     during: NDArray[np.void] = rows[(rows["phase"] == Phase.TRACK) & (np.abs(rows["mission_t_s"]) < MAX_RUN_US / 1e6)]
     return during
+
+
+def missions(rows: NDArray[np.void]) -> list[NDArray[np.void]]:
+    """Return the ticks of each mission that was flown, one after the other."""
+    during = tracking_rows(rows)
+    return np.split(during, _begins(during["mission_t_s"]))
+
+
+def newest_mission(rows: NDArray[np.void]) -> NDArray[np.void]:
+    """Return the ticks of the mission that was flown last: an operator may have set another, which begins anew."""
+    return missions(rows)[-1]
+
+
+def goal_ned_m(mission: NDArray[np.void]) -> Array | None:
+    """Return the place (3,) at which the reference of a mission has come to rest; None while it moves."""
+    last = mission["ref_pos_ned_m"][-_LAST_TICKS:]
+    return None if not len(last) or np.ptp(last, axis=0).max() >= _AT_REST_M else np.asarray(last[-1])
+
+
+def unbroken_mission_t_s(rows: NDArray[np.void]) -> Array:
+    """Return the mission time (T,) of ticks of a mission, which goes on where another mission begins in flight."""
+    times_s: Array = rows["mission_t_s"].astype(np.float64)
+    for begin in _begins(times_s):
+        elapsed_s = float(rows["t_us"][begin] - rows["t_us"][begin - 1]) * 1e-6
+        times_s[begin:] += times_s[begin - 1] + elapsed_s - times_s[begin]
+    return times_s
+
+
+def _begins(times_s: Array) -> NDArray[np.intp]:
+    """Return the ticks at which mission time (T,) begins again."""
+    return np.flatnonzero(np.diff(times_s) < -_AGAIN_S) + 1
 
 
 def mission_start_us(ticks: Mapping[int, NDArray[np.void]], time_field: str) -> float | None:
@@ -151,12 +186,12 @@ def true_positions(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) 
 
 
 def shared_references(ticks: Mapping[int, NDArray[np.void]]) -> dict[int, list[int]]:
-    """Return the agents that have flown the same reference, by the lowest number among them.
+    """Return the agents that have flown the same reference in their newest mission, by the lowest number among them.
 
     Agents tick at different instants: references are compared at the same mission times.
     """
     found: dict[int, list[int]] = {}
-    flown = {agent: tracking_rows(rows) for agent, rows in sorted(ticks.items())}
+    flown = {agent: newest_mission(rows) for agent, rows in sorted(ticks.items())}
     for agent, rows in flown.items():
         if len(rows):
             same = (other for other in found if _apart_01(rows, flown[other]) < _DIFFERENT_01)
@@ -181,4 +216,9 @@ def track_error(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) -> 
     error_ned_m = true_positions(tracking, truth, agent) - tracking["ref_pos_ned_m"]
     known = np.isfinite(error_ned_m).all(axis=1)
     error_ned_m = error_ned_m[known]
-    return TrackError(tracking["mission_t_s"][known], error_ned_m, np.linalg.norm(error_ned_m, axis=1))
+    return TrackError(
+        unbroken_mission_t_s(tracking)[known],
+        error_ned_m,
+        np.linalg.norm(error_ned_m, axis=1),
+        float(tracking["mission_t_s"][known][-1]) if known.any() else 0.0,
+    )

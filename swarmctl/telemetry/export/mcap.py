@@ -28,7 +28,8 @@ from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import Array
 from swarmctl.errors import StartError
 from swarmctl.files import replaced
-from swarmctl.telemetry.evaluation.referee import RunData
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle, RunData
+from swarmctl.telemetry.evaluation.tracks import goal_ned_m, missions
 from swarmctl.telemetry.palette import LIMIT_RGB, NUMBER_RGB, agent_rgb
 from swarmctl.telemetry.recording.run_files import utc_us_of
 from swarmctl.telemetry.recording.tables import named_table
@@ -55,6 +56,7 @@ class RecordedFlight:
     run: RunData
     plans: Mapping[int, NDArray[np.void]]  # predicted paths of each agent, rows of `PLAN_DTYPE`
     flight: ViewedFlight
+    obstacles: Sequence[JudgedObstacle]
     config_toml: str
     summary_json: str
 
@@ -103,9 +105,9 @@ class _Export:
         truth = self._recorded.run.truth
         first = next(iter(self._ticks.values()), None)
         utc_minus_host_us = 0 if first is None else int(first["utc_us"][0]) - int(first["t_us"][0])
-        streams = [self._still(), self._obstacles(), self._event_logs()]
+        streams = [self._still(), self._event_logs(), *self._obstacles()]
         for agent, rows in self._ticks.items():
-            streams += [self._vehicle(agent, rows), self._plans(agent, rows)]
+            streams += [self._vehicle(agent, rows), self._plans(agent, rows), self._goals(agent, rows)]
             streams.append(self._values(f"/agent/{agent}/tick", COLUMNS, rows, rows["utc_us"]))
         for vehicle in np.unique(truth["vehicle"]):
             rows = truth[truth["vehicle"] == vehicle]
@@ -116,15 +118,23 @@ class _Export:
     # -- scene --------------------------------------------------------------------------------------------------------
 
     def _still(self) -> Messages:
-        """Yield what does not change: the frames' relation, and goals."""
+        """Yield what does not change: the frames' relation."""
         half = math.sqrt(0.5)  # z up: x is east, y is north
         up = self._messages.Quaternion(x=half, y=half, z=0.0, w=0.0)
         yield self._frame(self._begins_us, _WORLD, _NED, np.zeros(3), up)
-        for agent in self._ticks:
-            goal = self._recorded.flight.agents[agent].goal_ned_m if agent < len(self._recorded.flight.agents) else None
+
+    def _goals(self, agent: int, rows: NDArray[np.void]) -> Messages:
+        """Yield the goal of an agent: the configured one, then that of each mission that was set in flight."""
+        known = self._recorded.flight.agents
+        first = known[agent].goal_ned_m if agent < len(known) else None
+        goals: list[tuple[int, Sequence[float] | Array | None]] = [(self._begins_us, first)]
+        goals += [(int(mission["utc_us"][0]), goal_ned_m(mission)) for mission in missions(rows)[1:]]
+        for utc_us, goal in goals:
             if goal is not None:
                 ball = self._ball(goal, _GOAL_M, (*agent_rgb(agent), 90))
-                yield self._draw(self._begins_us, f"goal-{agent}", _NED, spheres=[ball])
+                yield self._draw(utc_us, f"goal-{agent}", _NED, spheres=[ball])
+            elif utc_us > self._begins_us:
+                yield self._erase(utc_us, f"goal-{agent}")
 
     def _vehicle(self, agent: int, rows: NDArray[np.void]) -> Messages:
         """Yield the frame of a body in every tick; ten times a second the body and its reference."""
@@ -147,19 +157,32 @@ class _Export:
             line = self._line(points_ned_m, (*agent_rgb(agent), 200))
             yield self._draw(t_us + offset_us, f"plan-{agent}", _NED, lines=[line])
 
-    def _obstacles(self) -> Messages:
-        """Yield obstacles of the configuration: once, or five times a second where any moves."""
-        obstacles = self._recorded.flight.obstacles
-        ends_us = max((int(rows["utc_us"][-1]) for rows in self._ticks.values()), default=self._begins_us)
-        moving = any(obstacle.moves for obstacle in obstacles)
-        for at_us in range(self._begins_us, ends_us, _OBSTACLE_STEP_US) if moving else (self._begins_us,):
-            for number, obstacle in enumerate(obstacles):
-                at_ned_m = obstacle.center_after((at_us - self._begins_us) * 1e-6)
-                if obstacle.column:
-                    drawn = {"cylinders": [self._column(at_ned_m, obstacle.radius_m)]}
-                else:
-                    drawn = {"spheres": [self._ball(at_ned_m, obstacle.radius_m, (*LIMIT_RGB, 200))]}
-                yield self._draw(at_us, f"obstacle-{number}", _NED, **drawn)
+    def _obstacles(self) -> Iterator[Messages]:
+        """Yield what draws each obstacle, until the next one of its number begins."""
+        known = self._recorded.obstacles
+        for k, judged in enumerate(known):
+            yield self._obstacle(
+                judged, next((later for later in known[k + 1 :] if later.number == judged.number), None)
+            )
+
+    def _obstacle(self, judged: JudgedObstacle, following: JudgedObstacle | None) -> Messages:
+        """Yield an obstacle while it is there: once, or five times a second where it moves."""
+        obstacle, name = judged.obstacle, f"obstacle-{judged.number}"
+        since_us = self._begins_us if judged.since_utc_us is None else judged.since_utc_us
+        begins_us = max(since_us, self._begins_us)
+        ends_us = max((int(rows["utc_us"][-1]) for rows in self._ticks.values()), default=begins_us)
+        gone_us = judged.until_utc_us if following is None else following.since_utc_us
+        if gone_us is not None:
+            ends_us = min(ends_us, gone_us)
+        for at_us in range(begins_us, ends_us, _OBSTACLE_STEP_US) if obstacle.moves else (begins_us,):
+            at_ned_m = obstacle.center_after((at_us - since_us) * 1e-6)
+            if obstacle.column:
+                drawn = {"cylinders": [self._column(at_ned_m, obstacle.radius_m)]}
+            else:
+                drawn = {"spheres": [self._ball(at_ned_m, obstacle.radius_m, (*LIMIT_RGB, 200))]}
+            yield self._draw(at_us, name, _NED, **drawn)
+        if gone_us is not None and following is None:
+            yield self._erase(gone_us, name)
 
     def _draw(self, utc_us: int, name: str, frame: str, **primitives: Any) -> tuple[int, Callable[..., None]]:
         """Return the message that draws something, in the place of what was drawn under that name."""
@@ -167,6 +190,14 @@ class _Export:
         at = _timestamp(m, utc_us)
         entity = m.SceneEntity(timestamp=at, frame_id=frame, id=name, frame_locked=True, **primitives)
         return utc_us, partial(self._scene.log, m.SceneUpdate(entities=[entity]))
+
+    def _erase(self, utc_us: int, name: str) -> tuple[int, Callable[..., None]]:
+        """Return the message that erases what was drawn under a name."""
+        m = self._messages
+        deletion = m.SceneEntityDeletion(
+            timestamp=_timestamp(m, utc_us), type=m.SceneEntityDeletionType.MatchingId, id=name
+        )
+        return utc_us, partial(self._scene.log, m.SceneUpdate(deletions=[deletion]))
 
     def _frame(
         self, utc_us: int, parent: str, child: str, at_m: Array, rotation: Any

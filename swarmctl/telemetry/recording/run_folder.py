@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text, write_each
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
 from swarmctl.telemetry.json_safe import to_json
+from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
 from swarmctl.telemetry.recording.run_files import (
     AGENT_FILE,
     CONFIG,
@@ -104,7 +105,7 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
 
     Args:
         directory: the run folder.
-        rules: limits.
+        rules: limits; obstacles that an operator has set count as recorded.
         outcome: how the run ended.
         recorded: the recorded run if it is still in memory; None to load it from the folder.
 
@@ -113,6 +114,7 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
     """
     run = load_run(directory) if recorded is None else recorded
     run.events[:] = _merged(run.events, outcome.events)
+    rules = _with_obstacles(rules, run)
     summary = evaluate(run, rules, outcome.outcome, outcome.problems, speed_factor=outcome.speed_factor)
     writers: dict[str, Callable[[], object]] = {
         EVENTS: partial(_write_events, directory, run.events),
@@ -141,23 +143,23 @@ def report_run(directory: Path, rules: Rules) -> Path:
         return directory / REPORT
     judged = read_judged(directory, rules)
     try:
-        return write_report(directory, judged.run, judged.summary, judged.config_text, rules=rules)
+        return write_report(directory, judged.run, judged.summary, judged.config_text, rules=judged.rules)
     except OSError as error:
         raise StartError(f"{directory / REPORT}: can't be written: {error.strerror or error}") from error
 
 
-def write_run_figures(directory: Path, rules: Rules) -> Path:
-    """Write every figure of a finished run as an SVG file; returns their folder.
+def write_run_figures(directory: Path, rules: Rules, *, png: bool = False) -> Path:
+    """Write every figure of a finished run as an SVG file, and as PNG too; returns their folder.
 
     Raises:
         ConfigError: the run is not finished, or a file in the folder has not the expected content.
-        StartError: the folder can't be written to.
+        StartError: the folder can't be written to, or PNG needs a library that is not installed.
     """
     judged = read_judged(directory, rules)
     if (directory / FIGURES).is_symlink():
         raise ConfigError(str(directory / FIGURES), ["is a symbolic link. Remove it"])
     try:
-        return write_figures(directory, judged.run, judged.summary, rules=rules)
+        return write_figures(directory, judged.run, judged.summary, rules=judged.rules, png=png)
     except OSError as error:
         raise StartError(f"{directory / FIGURES}: can't be written: {error.strerror or error}") from error
 
@@ -177,7 +179,7 @@ def compare_runs(path: Path, runs: Sequence[tuple[Path, Rules]]) -> Path:
 
 
 def read_judged(directory: Path, rules: Rules) -> JudgedRun:
-    """Return a finished run with its summary.
+    """Return a finished run with its summary, and the rules with the obstacles that there were.
 
     Raises:
         ConfigError: it is not finished, or a file in the folder has not the expected content.
@@ -186,8 +188,12 @@ def read_judged(directory: Path, rules: Rules) -> JudgedRun:
     if summary is None:
         raise ConfigError(str(directory), [f"holds no {SUMMARY}. Complete the run: swarmctl report {directory}"])
     refuse_other_swarm(directory, summary, rules.agents)
-    config_text = read_text(directory / CONFIG)
-    return JudgedRun(directory.resolve().name, load_run(directory), summary, rules, config_text)
+    run, config_text = load_run(directory), read_text(directory / CONFIG)
+    return JudgedRun(directory.resolve().name, run, summary, _with_obstacles(rules, run), config_text)
+
+
+def _with_obstacles(rules: Rules, run: RunData) -> Rules:
+    return replace(rules, obstacles=recorded_obstacles(rules.obstacles, run.events))
 
 
 def _merged(*sources: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

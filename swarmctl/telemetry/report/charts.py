@@ -112,6 +112,7 @@ def time_chart(
     from_zero: bool = False,
     ceiling: float | None = None,
     windows: Sequence[Window] = (),
+    x_unit: str = "s",
 ) -> Figure:
     """Return a chart over time.
 
@@ -126,6 +127,7 @@ def time_chart(
         from_zero: whether the value axis begins at 0.
         ceiling: largest value shown; higher ones leave the plot.
         windows: shaded parts, clipped to the plot.
+        x_unit: unit of the axis below, if that is no time.
     """
     low, high = _value_range([line.y for line in lines], [limit.value for limit in limits], from_zero, ceiling)
     x, y = _axes(svg.widened(*x_range), (low, high), height)
@@ -140,7 +142,7 @@ def time_chart(
     if band is not None:
         left, right = x.clipped_px(band)
         behind = element("rect", class_="band", x=left, y=svg.TOP_PX, width=right - left, height=tall)
-    return svg.figure(title, height, [behind, svg.grid(x, y), clipped], lines)
+    return svg.figure(title, height, [behind, svg.grid(x, y, x_unit), clipped], lines)
 
 
 def top_view(
@@ -156,7 +158,7 @@ def top_view(
     more_x = (wide / scale - (x_high - x_low)) / 2
     more_y = ((height - svg.TOP_PX - svg.BOTTOM_PX) / scale - (y_high - y_low)) / 2
     x, y = _axes((x_low - more_x, x_high + more_x), (y_low - more_y, y_high + more_y), height)
-    parts = [svg.grid(x, y)]
+    parts, marks = [svg.grid(x, y)], list[str]()
     for ball in balls:
         center = {"cx": float(x.px(ball.center_ned_m[1])), "cy": float(y.px(ball.center_ned_m[0]))}
         parts.append(element("circle", class_="obstacle", **center, r=float(ball.radius_m * scale)))
@@ -166,12 +168,13 @@ def top_view(
         if line.label and not line.dash and len(line.x) and np.isfinite(line.y[-1]):
             at = float(x.px(line.x[-1])), float(y.px(line.y[-1]))
             parts.append(dot(*at, 4, line.color))
-            parts += [svg.tick(at[0] + 7, at[1] - 8, line.end, "start")] if line.end else []
+            marks += [svg.mark(at[0] + 7, at[1] - 8, line.end)] if line.end else []
     for goal in goals:
         cx, cy = float(x.px(goal.pos_ned_m[1])), float(y.px(goal.pos_ned_m[0]))
         ring = element("circle", cx=cx, cy=cy, r="7", fill="none", stroke=goal.color, stroke_width="2")
-        parts += [ring, svg.tick(cx + 11, cy + 10, goal.label, "start")]
-    return svg.figure(title, height, parts, lines)
+        parts.append(ring)
+        marks.append(svg.mark(cx + 11, cy + 10, goal.label))
+    return svg.figure(title, height, [*parts, *marks], lines)
 
 
 def space_view(title: str, lines: Sequence[SpaceLine], balls: Sequence[Ball] = (), points: int = 600) -> Figure:
@@ -278,7 +281,7 @@ def state_bars(title: str, rows: Sequence[tuple[str, Sequence[Span]]], x_range: 
             place = {"x": left, "y": top, "width": max(0.6, right - left), "height": 16}
             parts.append(element("rect", words, **place, fill=span.color))
     height = svg.TOP_PX + _BAR_PX * len(rows) + svg.BOTTOM_PX
-    parts.append(svg.axis_below(x, Axis(low=0.0, high=1.0, first=height - svg.BOTTOM_PX, last=svg.TOP_PX)))
+    parts.append(svg.axis_below(x, Axis(low=0.0, high=1.0, first=height - svg.BOTTOM_PX, last=svg.TOP_PX), "s"))
     return svg.figure(title, height, parts, states.values())
 
 

@@ -18,8 +18,10 @@ from swarmctl.telemetry.evaluation.referee import Rules, RunData
 from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
+    goal_ned_m,
     merge_tracks,
     mission_start_us,
+    newest_mission,
     shared_references,
     track_error,
     tracking_rows,
@@ -43,8 +45,6 @@ from swarmctl.telemetry.report.svg import Figure
 
 DETAILED_AGENTS = 6  # number of agents with attitude charts
 _ALL_POINTS = 42_000  # points of all lines together, 13 bytes each: keeps the page below 1 MB
-_AT_REST_M = 0.01  # a reference that moves less in its last ticks has come to rest, and is a goal
-_LAST_TICKS = 10
 _ALL_REFERENCES = reference_line(np.zeros(0), np.zeros(0))  # for the legend: each is in the colour of its agent
 
 
@@ -83,10 +83,10 @@ class RunCharts:
             pos_ned_m = true_positions(rows, self._run.truth, agent)
             lines.append(agent_line(agent, pos_ned_m[:, 1], pos_ned_m[:, 0], width=1.6, end=f"{agent}"))
         for agent, group in self._references.items():
-            last = tracking_rows(self._run.ticks[agent])["ref_pos_ned_m"][-_LAST_TICKS:]
-            if np.ptp(last, axis=0).max() < _AT_REST_M:
+            place_ned_m = goal_ned_m(newest_mission(self._run.ticks[agent]))
+            if place_ned_m is not None:
                 name = "goal" if self._is_shared else f"goal {', '.join(map(str, group))}"
-                goals.append(Goal(last[-1], name, self._color_of(agent)))
+                goals.append(Goal(place_ned_m, name, self._color_of(agent)))
         obstacles = [judged.obstacle for judged in self._rules.obstacles] if self._rules else []
         balls = [Ball(obstacle.center_ned_m, obstacle.keep_out_m, "keepout") for obstacle in obstacles]
         return top_view("From above: north up, east right [m]", lines, balls, self._points, goals=goals)

@@ -8,10 +8,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from swarmctl.files import replace_text
+from swarmctl.files import replace_bytes, replace_text
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR, Rules, RunData
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.report.pages import render
+from swarmctl.telemetry.report.png import png_of
 from swarmctl.telemetry.report.run_charts import RunCharts
 from swarmctl.telemetry.report.svg import Figure
 
@@ -51,13 +52,22 @@ def write_report(
     return path
 
 
-def write_figures(directory: Path, run: RunData, summary: Mapping[str, Any], *, rules: Rules | None = None) -> Path:
-    """Write every figure of a judged run as an SVG file into `figures/` of its folder; returns that folder."""
+def write_figures(
+    directory: Path, run: RunData, summary: Mapping[str, Any], *, rules: Rules | None = None, png: bool = False
+) -> Path:
+    """Write every figure of a judged run as SVG, and as PNG too, into `figures/` of its folder; returns that folder.
+
+    Raises:
+        StartError: PNG was asked for, and its library is not installed.
+    """
     charts, folder = RunCharts(run, summary, rules), directory / FIGURES
     folder.mkdir(exist_ok=True)
     for number, figure in enumerate([charts.seen_from_above(), *itertools.chain(*_sections(charts).values())], 1):
         words = re.sub(r"[^a-z0-9]+", "-", re.sub(r"\[.*?\]", "", figure.heading).lower()).strip("-")
-        replace_text(folder / f"{number:02}-{words}.svg", figure.as_file())
+        document, path = figure.as_file(), folder / f"{number:02}-{words}.svg"
+        replace_text(path, document)
+        if png:
+            replace_bytes(path.with_suffix(".png"), png_of(document))
     return folder
 
 
@@ -77,6 +87,7 @@ class SummaryRow(NamedTuple):
     limit: str = ""
     good: bool | None = None
     number: float | None = None  # to compare it with that of another run
+    note: str = ""  # what it is
 
 
 def _event_rows(run: RunData, charts: RunCharts) -> Iterator[tuple[str, object, object, str]]:
@@ -101,10 +112,10 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     late = f"{timing['late_ticks']} of {due}"
     limit = "" if most is None else f"{most:.0%}"
     yield SummaryRow("deadline misses", late, limit, good, timing["late_ticks"])
-    named = (f"summed mean tracking error ({SUMMED_ERROR})", "index_m"), ("the same after 10 s", "index_after_10s_m")
-    for name, key in named:
+    named = ("summed mean tracking error", "index_m", SUMMED_ERROR), ("the same after 10 s", "index_after_10s_m", "")
+    for name, key, note in named:
         error_m = summary["tracking"][key]
-        yield SummaryRow(name, _figure(error_m, "m", 3), number=error_m)
+        yield SummaryRow(name, _figure(error_m, "m", 3), number=error_m, note=note)
     for name, key in (("tick time", "tick_ms"), ("solve time", "solve_ms")):
         values = " / ".join(_figure(timing[key][part], "", 2) for part in ("p50", "p99", "max"))
         yield SummaryRow(f"{name}, median / p99 / max", f"{values} ms", number=timing[key]["p50"])
@@ -116,7 +127,7 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     yield SummaryRow("ticks in which the safety filter acted", str(solver.get("safety_filter_ticks", 0)))
     yield SummaryRow("largest residual of a flown plan", _figure(solver["max_residual_m"], "m", 5))
     ages = " / ".join(_figure(comms["path_age_ms"][part], "", 1) for part in ("p50", "p99"))
-    yield SummaryRow("age of peers' paths, median / p99", f"{ages} ms")
+    yield SummaryRow("plan staleness, median / p99", f"{ages} ms", note="age of the oldest of the peers' newest paths")
     refused = ", ".join(f"{reason} {count}" for reason, count in comms["rejected"].items()) or "none"
     yield SummaryRow("bus messages refused", refused)
     if (unresponsive := comms.get("unresponsive") or {}).get("count"):

@@ -6,8 +6,10 @@ All charts of all pages are made of these. Text and attributes are escaped; numb
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from markupsafe import Markup
@@ -17,6 +19,7 @@ from swarmctl.telemetry.report.pages import render
 
 WIDTH_PX = 640
 LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 62, 12, 8, 30  # margins around the plot: texts grow on narrow screens
+_VARIABLE = re.compile(r"var\((--[a-z-]+)\)")
 _LEGEND_PX, _CHARACTER_PX = 18, 6.5  # of a figure as a file: height of a row of its legend, width of a character
 
 
@@ -86,21 +89,29 @@ def tick(px: float, py: float, text: str, anchor: str) -> Markup:
     return element("text", text, class_="tick", x=px, y=py, dy=".32em", text_anchor=anchor)
 
 
-def grid(x: Axis, y: Axis) -> Markup:
-    """Return horizontal lines with their values, and the axis below with its own."""
+def mark(px: float, py: float, text: str) -> Markup:
+    """Return a small text that begins at a point and is read over lines."""
+    return element("text", text, class_="tick mark", x=px, y=py, dy=".32em")
+
+
+def grid(x: Axis, y: Axis, x_unit: str = "") -> Markup:
+    """Return horizontal lines with their values, and the axis below with its own, the last of them with a unit."""
     parts = []
     for value in round_numbers(y.low, y.high, 4):
         py = float(y.px(value))
         parts.append(element("path", class_="grid", d=f"M{x.first} {py:.1f}H{x.last}"))
         parts.append(tick(x.first - 6, py, f"{value:g}", "end"))
-    return Markup("").join([*parts, axis_below(x, y)])
+    return Markup("").join([*parts, axis_below(x, y, x_unit)])
 
 
-def axis_below(x: Axis, y: Axis) -> Markup:
-    """Return the horizontal axis with its ticks."""
+def axis_below(x: Axis, y: Axis, unit: str = "") -> Markup:
+    """Return the horizontal axis with its ticks, the last of them with a unit."""
     line = element("path", class_="axis", d=f"M{x.first} {y.first:.1f}H{x.last}")
     values = round_numbers(x.low, x.high, 7)
-    ticks = [tick(float(x.px(value)), float(y.first + 16), f"{value:g}", "middle") for value in values]
+    texts = [f"{value:g}" for value in values[:-1]] + [f"{value:g} {unit}".rstrip() for value in values[-1:]]
+    ticks = [
+        tick(float(x.px(value)), float(y.first + 16), text, "middle") for value, text in zip(values, texts, strict=True)
+    ]
     return Markup("").join([line, *ticks])
 
 
@@ -113,10 +124,13 @@ class Figure(Markup):
     _legend: Sequence[Stroke]
 
     def as_file(self) -> str:
-        """Return a whole SVG document, in light colours, with title and legend."""
+        """Return a whole SVG document, in light colours, with title and legend.
+
+        Colours are written out: few programs but browsers know variables.
+        """
         keys, rows = _legend_keys(self._legend, self._height_px + 2 * _LEGEND_PX)
         height_px = self._height_px + _LEGEND_PX * (1.5 + rows)
-        return render(
+        document = render(
             __package__,
             "figure.svg",
             title=self.heading,
@@ -125,6 +139,14 @@ class Figure(Markup):
             width_px=WIDTH_PX,
             height_px=height_px,
         )
+        colors = _light_colors()
+        return _VARIABLE.sub(lambda found: colors[found[1]], document)
+
+
+@cache
+def _light_colors() -> Mapping[str, str]:
+    """Return the colours of a page by day, by the names of their variables."""
+    return dict(re.findall(r"(--[a-z-]+): *([^;]+);", render(__package__, "light.css")))
 
 
 def figure(title: str, height_px: float, parts: Iterable[str], legend: Iterable[Stroke]) -> Figure:

@@ -8,12 +8,13 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from swarmctl.core.tick_record import CURVES
+from swarmctl.core.tick_record import CURVES, Curve
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 TIMELINE = "flight_time"
 _PLOT_S = 20.0  # sliding window of the plots
 _TRAIL_S = 12.0  # length of the trails behind vehicles
+_SHARE = (0.0, 1.05)  # axis of a share, with room above
 _TABS = 20  # largest number of agents that get a tab
 _LEGENDS = 5  # agents that a legend in a small plot has room for
 _ROWS = 8  # agents that a low table has room for
@@ -63,10 +64,13 @@ def _space(name: str, flight: ViewedFlight, camera: Any, origin: str = "/world")
 
 def _plots(name: str, page: str, agents: int) -> Any:
     """Return a page with a curve for each agent in every plot; of many agents the first, larger one has the legend."""
-    plots = [("/plot/track_err", "Distance to the reference [m]")] if page == "swarm" else []
-    plots += [(f"/plot/{key}", curve.title) for key, curve in CURVES.items() if curve.page == page]
+    error = [("track_err", Curve(title="Distance to the reference [m]"))] if page == "swarm" else []
+    plots = error + [(key, curve) for key, curve in CURVES.items() if curve.page == page]
     crowded = agents > _LEGENDS
-    views = [_plot(origin, title, legend=not crowded or k == 0) for k, (origin, title) in enumerate(plots)]
+    views = [
+        _plot(f"/plot/{key}", curve.title, legend=not crowded or k == 0, is_share=curve.is_share)
+        for k, (key, curve) in enumerate(plots)
+    ]
     shares = [3.0 if crowded and k == 0 else 1.0 for k in range(len(views))]
     if page == "swarm":
         views.insert(1, _plot("/plot/separation", "Smallest separation and its limit [m]"))
@@ -95,11 +99,12 @@ def _agent_page(agent: int, flight: ViewedFlight) -> Any:
     return rrb.Vertical(top, margins, *pairs, row_shares=[3, 2, 2, 2, 2], name=f"{agent}")
 
 
-def _plot(origin: str, name: str, legend: bool = True) -> Any:
+def _plot(origin: str, name: str, *, legend: bool = True, is_share: bool = False) -> Any:
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
+        axis_y=rrb.ScalarAxis(range=_SHARE) if is_share else None,
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=_cursor(-_PLOT_S), end=_cursor())),
     )
 

@@ -16,6 +16,8 @@ from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 _SAME_M = 0.2  # references that differ by less at the same mission time are drawn as one
 _RECENT_S = 1.5  # a reference that is older than another by more is not compared with it
+_AGAIN_S = 0.5  # mission time that falls by more begins again
+_AT_REST_M_S = 0.01
 _EVERY = 5  # ticks from one drawn reference to the next
 
 
@@ -39,6 +41,10 @@ class References:
         self._newest: dict[int, _Newest] = {}
         self._shares: dict[int, int] = {}  # lowest agent with the same reference, by agent
         self._drawn: set[int] = set()
+        bounds = enumerate(flight.agents)
+        self._goals = {agent: np.array(own.goal_ned_m) for agent, own in bounds if own.goal_ned_m is not None}
+        self._goals_drawn: set[int] = set()  # by the lowest agent of each
+        self._changed: set[int] = set()  # agents whose mission an operator has changed
 
     def begin(self) -> None:
         """Send styles and goals."""
@@ -46,13 +52,7 @@ class References:
             self._stream.static(f"world/reference/{agent}", rr.Points3D.from_fields(radii=[0.07]))
             trail = rr.LineStrips3D.from_fields(colors=[(*REFERENCE_RGB, 110)], radii=[0.012])
             self._stream.static(f"world/reference_trail/{agent}", trail)
-        goals = {k: bounds.goal_ned_m for k, bounds in enumerate(self._flight.agents) if bounds.goal_ned_m is not None}
-        for first, agents in sharing({agent: np.array(goal) for agent, goal in goals.items()}).items():
-            label = "goal" if len(agents) == len(self._flight.agents) else f"goal {', '.join(map(str, agents))}"
-            points = rr.Points3D([goals[first]], colors=[agent_rgb(first)], radii=[0.1])
-            self._stream.static(f"world/goal/{first}", points)
-            name = rr.Points3D([goals[first]], colors=[NUMBER_RGB], radii=[0.001], labels=[label], show_labels=True)
-            self._stream.static(f"world/goal/{first}/name", name)
+        self._draw_goals()
 
     def take(self, agent: int, t_us: Times, rows: NDArray[np.void]) -> None:
         """Draw the references in rows (T,) of one agent at times `t_us` (T,), while it tracks them."""
@@ -61,6 +61,7 @@ class References:
         if tracking.any():
             before = self._newest.get(agent)
             self._newest[agent] = _newest(rows[tracking], before)
+            self._note_goal(agent, before)
             shown = not self._note_sharing(agent)
         if shown:
             self._draw(agent, t_us[tracking], rows["ref_pos_ned_m"][tracking], before)
@@ -76,6 +77,36 @@ class References:
         self._stream.columns(f"world/reference/{agent}", t_us[every], columns)
         ends, lines = pieces(pos_ned_m, None if before is None else before.pos_ned_m, _EVERY)
         self._stream.strips(f"world/reference_trail/{agent}", t_us[ends], lines)
+
+    def _note_goal(self, agent: int, before: _Newest | None) -> None:
+        """Replace the goal of an agent whose mission begins again, which is then another: where its reference rests."""
+        own = self._newest[agent]
+        if before is not None and own.mission_t_s < before.mission_t_s - _AGAIN_S:
+            self._changed.add(agent)
+        if agent not in self._changed:
+            return
+        rests = float(np.linalg.norm(own.vel_ned_m_s)) < _AT_REST_M_S
+        known = self._goals.get(agent)
+        if not rests and known is not None:
+            del self._goals[agent]
+            self._draw_goals()
+        elif rests and (known is None or float(np.linalg.norm(known - own.pos_ned_m)) > _SAME_M):
+            self._goals[agent] = own.pos_ned_m
+            self._draw_goals()
+
+    def _draw_goals(self) -> None:
+        """Send all goals, for the whole time."""
+        shared = sharing(self._goals)
+        for first in self._goals_drawn - shared.keys():
+            for path in (f"world/goal/{first}", f"world/goal/{first}/name"):
+                self._stream.static(path, rr.Points3D.from_fields(positions=[]))
+        for first, agents in shared.items():
+            place = self._goals[first]
+            label = "goal" if len(agents) == len(self._flight.agents) else f"goal {', '.join(map(str, agents))}"
+            self._stream.static(f"world/goal/{first}", rr.Points3D([place], colors=[agent_rgb(first)], radii=[0.1]))
+            name = rr.Points3D([place], colors=[NUMBER_RGB], radii=[0.001], labels=[label], show_labels=True)
+            self._stream.static(f"world/goal/{first}/name", name)
+        self._goals_drawn = set(shared)
 
     def _note_sharing(self, agent: int) -> bool:
         """Return whether an agent of a lower number has the same reference now, which is then noted."""

@@ -31,6 +31,7 @@ URL_FILE = "viewer.url"
 _SERVER_MEMORY = "512MiB"  # history for viewers that connect late
 _EXIT_TIMEOUT_S = 4.0  # longest time from SIGTERM to the exit, whatever hangs
 _FLUSH_TIMEOUT_S = 2.0
+_PAGE_LOOK_S = 0.2  # time between two looks whether the page is still served
 _PLOT_PERIOD_S = 0.4  # period of curves; poses are sent at --rate-hz
 _REDRAW_PERIOD_S = 5.0  # period of obstacles at rest, because the server's history drops rare data first
 
@@ -65,6 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--port", type=int, default=9876, help="loopback; the next free one when it is taken")
     parser.add_argument("--rate-hz", type=float, default=10.0, help="batches a second")
     parser.add_argument("--view", action="store_true", help="open the native viewer when there is a display")
+    parser.add_argument("--web", action="store_true", help="serve a page to browsers of this computer, too")
     parser.add_argument("--identity", metavar="JSON", help="as which it listens on a bus of several computers")
     parser.add_argument("--die-with-parent", action="store_true")
     return parser
@@ -101,6 +103,8 @@ def _run(options: argparse.Namespace, flight: ViewedFlight, stop: StopRequest) -
     scene.begin()
     feed = Feed(bus, agents)
     _announce(options, url)
+    if options.web:
+        threading.Thread(target=_serve_page, args=(url, options.run_dir / "web.log", stop), daemon=True).start()
     Pump(feed, scene, flight.obstacles).run(1.0 / options.rate_hz, stop)
     _end(rec, bus, f"telemetry lost={feed.lost} received={feed.received} malformed={feed.malformed}")
     return EXIT_OK
@@ -216,6 +220,19 @@ def _announce(options: argparse.Namespace, url: str) -> None:
     except (OSError, SwarmError) as error:
         print(f"viewer: {error}", file=sys.stderr)
     print(f"viewer {url}", flush=True)
+
+
+def _serve_page(url: str, log: Path, stop: StopRequest) -> None:
+    """Serve the page and print its address; it ends with the request, with this process, or by itself."""
+    from swarmctl.telemetry.view.web_page import web_page
+
+    try:
+        with web_page(url, log) as page:
+            print(f"page {page.url}", flush=True)
+            while page.process.poll() is None and not stop.is_set():
+                time.sleep(_PAGE_LOOK_S)
+    except (OSError, SwarmError) as error:
+        print(f"viewer: {error}", file=sys.stderr, flush=True)
 
 
 def _end(rec: Any, bus: Any, last_line: str) -> None:

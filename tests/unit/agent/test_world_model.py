@@ -12,7 +12,14 @@ import pytest
 
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import MAX_OBSTACLES, MAX_VERSION_STEP, CommandMessage, encode_message, first_list
+from swarmctl.bus.json_messages import (
+    MAX_OBSTACLES,
+    MAX_VERSION_STEP,
+    CommandMessage,
+    decode_obstacles,
+    encode_message,
+    first_list,
+)
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.control.collision.separation import SeparationParams
@@ -115,6 +122,16 @@ def test_a_version_far_ahead_does_not_block_later_ones() -> None:
     assert (bench.seen, bench.rejected) == (2, {"sequence": 1}), "what the launcher repeats is not refused, just known"
     bench.set_obstacles(4, 8 + MAX_VERSION_STEP)
     assert bench.seen == 4
+
+
+def test_a_list_of_obstacles_is_noted_as_it_was_received_when_it_is_another() -> None:
+    bench = Bench()
+    for count, version in ((0, 1), (1, 2), (1, 2), (2, 3)):
+        bench.set_obstacles(count, version)
+    noted = [row for row in bench.events if row["event"] == "obstacles_changed"]
+    messages = [decode_obstacles(row["listed"].encode()) for row in noted]
+    assert [(m.version, len(m.obstacles)) for m in messages if m] == [(2, 1), (3, 2)], "not what is only repeated"
+    assert messages[0] is not None and messages[0].obstacles[0].obstacle == BALL
 
 
 def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height() -> None:

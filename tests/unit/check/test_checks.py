@@ -460,7 +460,7 @@ def test_the_radius_has_to_cover_body_tracking_and_estimator(config: Config) -> 
 def test_limits_of_battery_and_link_are_shown_and_the_return_is_one_of_them(config: Config) -> None:
     lines = findings([HEALTHY, SECOND_OK], config)
     assert line_of(lines, "battery").wanted == "over 50%, warns at 30%, returns at 20%, lands at 10%"
-    assert line_of(lines, "loss").wanted.endswith("warns at 20%")
+    assert line_of(lines, "loss").wanted == "under 1%; in flight: warns at 20% of 5 s without a new state"
     strict = FailsafeParams(battery_warn_01=0.8, battery_rtl_01=0.7)
     agent = config.agent.model_copy(update={"failsafe": strict})
     low = changed(
@@ -705,3 +705,20 @@ def test_only_a_vehicle_disarmed_on_the_ground_may_be_flown(facts: VehicleFacts,
     lines = standing([facts])
     assert [line.found for line in lines] == found
     assert exit_code([facts], lines) == (0 if not found else 3 if facts.unreachable else 4)
+
+
+def test_a_terminal_shows_once_what_is_the_same_of_several_vehicles(
+    config: Config, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = findings([HEALTHY, SECOND_OK], config)
+    print_check([HEALTHY, SECOND_OK], lines, ())
+    assert capsys.readouterr().out.count("\tok\n") == sum(x.verdict is OK for x in lines), "a line each, for programs"
+    drawn = io.StringIO()
+    Console(file=drawn, width=300).print(_drawn(lines))
+    cells = [[cell.strip() for cell in row.split("│")[1:-1]] for row in drawn.getvalue().splitlines() if row[0] == "│"]
+    whose = [name for name, *_ in cells if name]
+    assert {"all", "agent-0", "agent-1"} <= set(whose)
+    assert len(whose) == len(set(whose)), "one section each"
+    shown = {tuple(row[1:]) for row in cells}
+    assert {(x.topic, x.found, x.wanted, x.verdict.name.lower()) for x in lines} == shown, "nothing is lost"
+    assert len(cells) < 0.7 * len(lines)

@@ -145,8 +145,9 @@ def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
     assert inherits.argv[inherits.argv.index("--local-fds") + 1] == ",".join(map(str, inherits.fds))
     for sock in (*held, *theirs):
         sock.close()
-    viewer = viewer_command(config, context, 9876, view=False).argv
-    assert "--view" not in viewer
+    viewer = viewer_command(config, context, 9876, view=False, web=False).argv
+    assert not {"--view", "--web"} & set(viewer)
+    assert {"--view", "--web"} <= set(viewer_command(config, context, 9876, view=True, web=True).argv)
     shown = ViewedFlight.model_validate_json(viewer[viewer.index("--flight") + 1])
     assert shown == viewed_flight(config)
     assert len(shown.agents) == config.swarm.agents

@@ -640,3 +640,14 @@ def test_only_answers_to_own_timesyncs_count() -> None:
     bench.say(dialect.MAVLink_timesync_message(bench.clock.now_us() * 1000, question.ts1))
     bench.poll()
     assert bench.pilot.clock.answered == 1
+
+
+def test_what_the_autopilot_says_is_kept_in_order_and_of_a_flood_the_newest() -> None:
+    bench = Bench().ready()
+    assert bench.pilot.next_text() is None
+    for k in range(30):
+        bench.say(dialect.MAVLink_statustext_message(4, f"fence {k}\x1b".encode()))
+    bench.say(dialect.MAVLink_statustext_message(2, b"of another vehicle"), Codec(9, 1))
+    bench.poll()
+    said = list(iter(bench.pilot.next_text, None))
+    assert said == [(4, f"fence {k}\\x1b") for k in range(10, 30)]

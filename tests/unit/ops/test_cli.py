@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import subprocess
@@ -18,9 +19,11 @@ import swarmctl
 from sitl.studies.bench import command
 from swarmctl.control.mpc.solvers.qp import SOLVERS
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
+from swarmctl.core.operator_verbs import MISSION, OPERATOR_VERBS, Answer, OperatorVerb, Order, VerbArgument
+from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, MissionError, StartError, exit_code_of
 from swarmctl.ops import cli, obstacle_list, operator
+from swarmctl.ops.order_delivery import Reply
 from swarmctl.ops.verbs import orders
 
 Run = Callable[..., int]
@@ -132,10 +135,10 @@ def test_rtl_help_says_that_the_agent_flies_home(run: Run, capsys: pytest.Captur
 def test_a_verb_of_the_operator_has_an_option_for_each_argument(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    given: list[tuple[Order, str | None, list[int]]] = []
+    given: list[tuple[Order, str | None, list[int], bool]] = []
 
-    def give(order: Order, run: str | None, agents: list[int]) -> int:
-        given.append((order, run, agents))
+    def give(order: Order, run: str | None, agents: list[int], as_json: bool) -> int:
+        given.append((order, run, agents, as_json))
         return 7
 
     app = typer.Typer(rich_markup_mode=None)
@@ -144,11 +147,11 @@ def test_a_verb_of_the_operator_has_an_option_for_each_argument(
         orders.add_operator_verb(app, name, OperatorVerb(help="Do.", phases=frozenset(), arguments=arguments), give)
     assert app(["climb", "--height", "2.5", "--agent", "1", "--run-dir", "r"], standalone_mode=False) == 7
     assert app(["hold"], standalone_mode=False) == 7
-    assert app(["hold", "0", "2", "--agent", "1", "--run", "circle"], standalone_mode=False) == 7
+    assert app(["hold", "0", "2", "--agent", "1", "--run", "circle", "--json"], standalone_mode=False) == 7
     assert given == [
-        (Order("climb", {"height_m": 2.5}), "r", [1]),
-        (Order("hold"), None, []),
-        (Order("hold"), "circle", [0, 2, 1]),
+        (Order("climb", {"height_m": 2.5}), "r", [1], False),
+        (Order("hold"), None, [], False),
+        (Order("hold"), "circle", [0, 2, 1], True),
     ]
     for wrong in (["climb"], ["climb", "--height", "20.5"], ["climb", "--height", "x"], ["hold", "--height", "1"]):
         with pytest.raises(SystemExit) as ended:
@@ -158,6 +161,35 @@ def test_a_verb_of_the_operator_has_an_option_for_each_argument(
     capsys.readouterr()
     app(["climb", "--help"], standalone_mode=False)
     assert "Height [m]." in capsys.readouterr().out
+
+
+def test_answers_as_json_name_everybody_and_the_exit_code_stays(capsys: pytest.CaptureFixture[str]) -> None:
+    replies = [
+        Reply(agent=0, verb="hold", answer=Answer("hold", 5, accepted=True), phase=Phase.TRACK),
+        Reply(agent=1, verb="hold", answer=Answer("hold", 5, accepted=False, reason="it is in LAND"), phase=Phase.LAND),
+        Reply(agent=2, verb="hold", answer=None),
+    ]
+    with pytest.raises(MissionError, match="agent-1 refuses: it is in LAND; agent-2 did not answer"):
+        orders.told("hold", "circle-1a", lambda: replies, as_json=True)
+    assert json.loads(capsys.readouterr().out) == {
+        "run": "circle-1a",
+        "order": "hold",
+        "agents": [
+            {"agent": 0, "accepted": True, "phase": "TRACK", "problem": ""},
+            {"agent": 1, "accepted": False, "phase": "LAND", "problem": "agent-1 refuses: it is in LAND"},
+            {"agent": 2, "accepted": None, "phase": None, "problem": "agent-2 did not answer within 5 s"},
+        ],
+    }
+    assert orders.told("hold", "circle-1a", lambda: replies[:1]) == 0
+    assert capsys.readouterr().out == "hold: circle-1a\nagent-0 accepts, TRACK\n"
+
+
+def test_every_verb_that_acts_on_a_launch_prints_json_too(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    verbs = [[name] for name in OPERATOR_VERBS if name != MISSION] + [["mission", "set"], ["status"], ["fault"]]
+    verbs += [["obstacle", name] for name in ("add", "move", "remove", "list", "load", "save")]
+    for verb in verbs:
+        assert run(*verb, "--help") == 0
+        assert "--json" in capsys.readouterr().out, verb
 
 
 def test_version_is_printed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
@@ -187,6 +219,15 @@ def test_expected_errors_are_words_and_their_exit_code(
     assert run("status") == code
     captured = capsys.readouterr()
     assert captured.err == f"{error}\n"
+
+
+def test_a_page_of_a_launch_without_a_view_is_refused_before_anything_starts(
+    run: Run, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    assert run("launch", "--web", "--set", "telemetry.enabled=false", "--run-dir", str(folder)) == 2
+    assert capsys.readouterr().err == "--web: telemetry.enabled = false: there is no view\n"
+    assert not folder.exists()
 
 
 def test_errors_control_no_terminal(run: Run, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

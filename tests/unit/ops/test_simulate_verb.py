@@ -22,7 +22,7 @@ def test_a_full_disk_costs_the_files_and_not_the_verdict(tmp_path: Path) -> None
     lines = done.stdout.splitlines()
     assert done.returncode == 4, done.stderr
     assert lines[0].startswith("completed, summed mean tracking error")
-    assert lines[1].startswith("separation - (required")
+    assert lines[1].startswith("no other agent")
     assert "agent-0.ticks: File too large" in lines[-1]
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy import optimize
 
 from sitl.studies.bench import bench, command, formation
@@ -251,3 +253,19 @@ def test_the_qp_is_much_faster_than_the_nonlinear_problem(captured: Captured) ->
     assert fmincon.times.p50_ms > times.qp("osqp").p50_ms
     alone = measure_xy(few, ["osqp"], slsqp=False)
     assert alone.fmincon is None and np.isnan(alone.speed_up())
+
+
+def test_the_tables_fit_80_columns_with_their_units() -> None:
+    cases = [
+        (suffix, solver, count) for suffix in ("", ", guaranteed") for solver in ("osqp", "daqp") for count in (0, 30)
+    ]
+    rows = [
+        bench.BenchRow(name=part + suffix, solver=solver, neighbours=count, p50_ms=12.34, p99_ms=1234.56)
+        for suffix, solver, count in cases
+        for part in bench.PARTS
+    ]
+    shown = io.StringIO()
+    bench.show(rows, Console(file=shown, width=80))
+    assert "\u2026" not in shown.getvalue(), "nothing is cut"
+    assert shown.getvalue().count("12.34 (1234.56)") == len(rows)
+    assert shown.getvalue().count("[ms]") == 2

@@ -20,7 +20,7 @@ from sitl.net.lossy import LossyLink
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.mavlink.framing import message_id
 from swarmctl.mavlink.transport import Datagram
-from swarmctl.ops.fault import inject, parse_fault
+from swarmctl.ops.fault import as_json, inject, line_of, parse_fault
 from swarmctl.ops.operator import RunningLaunch
 from swarmctl.process_lifetime import remove_socket
 from swarmctl.simulator_config import FAULTS, FaultParams
@@ -320,8 +320,12 @@ def test_a_running_simulator_takes_a_fault_and_answers(tmp_path: Path) -> None:
     thread = threading.Thread(target=serve)
     thread.start()
     try:
-        said = inject(launch_at(tmp_path), FaultParams(kind="motor", vehicle=1, value=0.25, for_s=2.0))
-        assert said.startswith("motor on vehicle 1 for 2 s")
+        fault = FaultParams(kind="motor", vehicle=1, value=0.25, for_s=2.0)
+        began_s = inject(launch_at(tmp_path), fault)
+        assert began_s == pytest.approx(0.1, abs=0.01)
+        assert line_of(fault, began_s) == "motor on vehicle 1 for 2 s, 0.1 s after the simulator's start"
+        told = json.loads(as_json("circle-1", fault, began_s))
+        assert (told["run"], told["kind"], told["vehicle"], told["since_boot_s"]) == ("circle-1", "motor", 1, began_s)
         assert flown.world.physics.rotor_health_01[:, 1].tolist() == [0.25, 1, 1, 1]
         assert flown.world.physics.rotor_health_01[:, 0].tolist() == [1, 1, 1, 1]
         with pytest.raises(ConfigError, match="vehicle = 2: allowed: 0 to 1"):

@@ -15,15 +15,18 @@ from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 
 from swarmctl.api.run import load_run
+from swarmctl.bus.json_messages import first_list
 from swarmctl.config import Config, dump
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.export import export_mcap
+from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
 from swarmctl.telemetry.view.recordings import viewer_binary
-from tests.unit.telemetry.test_run_folder import write_run
+from tests.unit.telemetry.test_run_folder import UTC_US, write_run
 
 MOVING = Obstacle(center_ned_m=(1.0, 2.0, -3.0), vel_ned_m_s=(0.5, 0.0, 0.0))
 COLUMN = Obstacle(center_ned_m=(4.0, 0.0, 0.0), column=True)
@@ -116,6 +119,37 @@ def test_vehicles_references_and_obstacles_are_drawn(path: Path) -> None:
     assert moved_m == pytest.approx(0.5 * (at_ns - begin_ns) * 1e-9, abs=1e-3)
     assert moved_m > 1.0
     assert next(entity for _, entity in drawn if entity.id == "obstacle-1").cylinders
+
+
+def test_obstacles_and_goals_are_those_of_the_moment(tmp_path: Path) -> None:
+    directory = tmp_path / "steered"
+    directory.mkdir()
+    write_run(directory, 2, 8.0)
+    (directory / "config.toml").write_text(dump(Config(obstacles=(COLUMN,))))
+    begin_us, moved = UTC_US + 5_000_000, COLUMN.model_copy(update={"center_ned_m": (9.0, 0.0, 0.0)})
+    lists = [(1.0, (COLUMN,)), (3.0, (moved,)), (6.0, ())]
+    rows = []
+    for version, (at_s, obstacles) in enumerate(lists, 1):
+        at_us = begin_us + round(at_s * 1e6)
+        row = {"utc_us": at_us + 50_000, "source": "launch", "event": "obstacles"}  # the launch hears of it later
+        rows.append(row | recorded_list(first_list(obstacles, at_us, version)))
+    (directory / "launch.events.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+    ticks = np.fromfile(directory / "agent-1.ticks", TICK_DTYPE)
+    again = np.flatnonzero(ticks["phase"] == Phase.TRACK)[100:]
+    ticks["mission_t_s"][again] -= ticks["mission_t_s"][again[0]]
+    ticks["ref_pos_ned_m"][again] = NED
+    ticks.tofile(directory / "agent-1.ticks")
+    finish_run(directory, Config().rules(), Outcome(outcome="completed"))
+    scene = messages(export_mcap(directory, None), "/scene")
+    drawn = [(at_ns, entity) for at_ns, update in scene for entity in update.entities]
+    there = [(at_ns, e.cylinders[0].pose.position.x) for at_ns, e in drawn if e.id == "obstacle-0"]
+    assert there == [((begin_us + round(at_s * 1e6)) * 1000, x_m) for at_s, x_m in ((1.0, 4.0), (3.0, 9.0))]
+    (gone,) = ((at_ns, deletion.id) for at_ns, update in scene for deletion in update.deletions)
+    assert gone == ((begin_us + 6_050_000) * 1000, "obstacle-0")
+    ((at_ns, goal),) = ((at_ns, e) for at_ns, e in drawn if e.id.startswith("goal-"))
+    assert (at_ns, goal.id) == (int(ticks["utc_us"][again[0]]) * 1000, "goal-1")
+    at = goal.spheres[0].pose.position
+    np.testing.assert_allclose([at.x, at.y, at.z], NED)
 
 
 def test_events_are_a_log_in_order_of_time(folder: Path, path: Path) -> None:

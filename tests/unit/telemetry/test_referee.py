@@ -15,6 +15,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunData, evaluate
+from swarmctl.telemetry.evaluation.tracks import track_error
 from swarmctl.telemetry.json_safe import to_json
 
 UTC0_US = 1_780_000_000_000_000
@@ -485,6 +486,23 @@ def test_a_mission_that_was_changed_in_flight_counts_with_its_own_duration() -> 
     ]
     summary = evaluate(run(APART, events=changed), rules, "completed")
     assert summary["violations"] == ["mission time 20.0 s of agent 1 below 30 s"]
+
+
+def test_a_mission_that_begins_again_goes_on_in_time_and_is_judged_by_its_own() -> None:
+    first, second = ticks(12, (1.0, 0.0, 0.0)), ticks(6, (3.0, 0.0, 0.0))
+    second["t_us"] += 12_020_000
+    second["utc_us"] += 12_020_000
+    rows = np.concatenate([first, second])
+    error = track_error(rows, truth(0, [], np.zeros((0, 3)))[:0], 0)
+    assert np.diff(error.mission_t_s) == pytest.approx(0.02)
+    assert error.mission_t_s[-1] == pytest.approx(18.02)
+    assert error.tracked_s == pytest.approx(6.0)
+    changed = [{"event": "mission_changed", "source": "agent-0", "duration_s": 6.0}]
+    rules = Rules(agents=1, required_separation_m=0.5, duration_s=38.0)
+    summary = evaluate(run({0: rows}, events=changed), rules, "completed")
+    assert summary["violations"] == [], "the second is complete"
+    after_10s_m = (100 * 1.0 + 301 * 3.0) / 401  # two seconds of the first, then all of the second
+    assert summary["tracking"]["index_after_10s_m"] == pytest.approx(after_10s_m, rel=1e-2)
 
 
 def test_mission_cut_short_is_no_pass() -> None:

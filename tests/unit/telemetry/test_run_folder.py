@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swarmctl import __version__
+from swarmctl.bus.json_messages import first_list
 from swarmctl.config import Config, dump
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
@@ -21,6 +22,7 @@ from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
+from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run
 from swarmctl.telemetry.report.charts import thin
@@ -76,6 +78,28 @@ def write_finished_run(directory: Path) -> None:
 
 FAR_BALL = JudgedObstacle(number=0, obstacle=Obstacle(center_ned_m=(20.0, 20.0, -2.0)))
 RULES = Rules(agents=3, required_separation_m=0.85, obstacles=(FAR_BALL,))
+
+
+def test_obstacles_that_an_operator_has_set_are_judged_and_drawn_also_later(tmp_path: Path) -> None:
+    near = Obstacle(center_ned_m=(-2.0, 4.6, -1.4), radius_m=0.2, keep_out_m=1.0)  # where the circle is after 4 s
+    for directory, changes in ((tmp_path / "plain", ()), (tmp_path / "set", ((1, ()), (2, (near,)), (3, ())))):
+        directory.mkdir()
+        write_run(directory, 3, 6.0)
+        (directory / "config.toml").write_text(dump(Config()))
+        rows = []
+        for version, obstacles in changes:
+            utc_us = UTC_US + 5_000_000 + version * 1_500_000  # there from 3 s to 4.5 s
+            listed = recorded_list(first_list(obstacles, utc_us, version))
+            rows.append({"utc_us": utc_us, "source": "launch", "event": "obstacles", **listed})
+        (directory / "launch.events.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+        summary = finish_run(directory, RULES, Outcome(outcome="completed")).summary
+        (directory / "report.html").unlink()
+        page = report_run(directory, RULES).read_text()
+        if changes:
+            assert summary["obstacles"]["min_clearance_m"] < 0.95
+            assert any("and obstacle 0" in text for text in summary["violations"])
+        assert page.count('<circle class="obstacle"') == 1, "the one that was set, or the configured one"
+        assert ("and obstacle 0" in page) is bool(changes)
 
 
 def test_launches_in_the_same_second_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,9 @@ from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.palette import LIMIT_RGB, REFERENCE_RGB, agent_rgb
 from swarmctl.telemetry.scene.curves import left_percent
+from swarmctl.telemetry.scene.references import References
 from swarmctl.telemetry.scene.states import status_table
+from swarmctl.telemetry.scene.stream import Stream
 from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
 from swarmctl.telemetry.view.recordings import simulated_recording
 
@@ -192,3 +194,45 @@ def contrast(rgb: tuple[int, int, int], other: tuple[int, int, int]) -> float:
     """Return the contrast ratio of the Web Content Accessibility Guidelines."""
     low, high = sorted(float(linear(color) @ [0.2126, 0.7152, 0.0722]) for color in (rgb, other))
     return (high + 0.05) / (low + 0.05)
+
+
+class Goals(Stream):
+    """A stream that keeps what is drawn of goals, by its path."""
+
+    def __init__(self) -> None:
+        self.shown: dict[str, list[list[float]]] = {}
+
+    def static(self, path: str, archetype: Any) -> None:
+        if path.startswith("world/goal") and not path.endswith("name"):
+            self.shown[path] = archetype.positions.as_arrow_array().to_pylist()
+
+    def now(self, path: str, t_us: int, archetype: Any) -> None:
+        """Nothing else is kept."""
+
+    def columns(self, path: str, t_us: Any, columns: Any) -> None:
+        """Nothing else is kept."""
+
+    def strips(self, path: str, t_us: Any, strips: Any) -> None:
+        """Nothing else is kept."""
+
+
+def test_a_goal_goes_with_its_mission_and_another_is_where_the_new_reference_rests() -> None:
+    first, other = [1.0, 0.0, -2.0], [4.0, 4.0, -2.0]
+    stream, flight = Goals(), ViewedFlight(agents=(AgentBounds(goal_ned_m=(1.0, 0.0, -2.0)),) * 2)
+    references = References(stream, flight)
+    references.begin()
+    assert stream.shown == {"world/goal/0": [first]}, "of both"
+    rows = flown(0)
+    rows = rows[rows["phase"] == Phase.TRACK][:40]
+    references.take(0, rows["t_us"].astype(np.int64), rows)
+    again = rows.copy()
+    again["mission_t_s"] -= again["mission_t_s"][0] + 0.5
+    rows["mission_t_s"] += 10.0
+    references.take(0, rows["t_us"].astype(np.int64), rows)
+    assert stream.shown == {"world/goal/0": [first]}, "while it flies the mission of its configuration"
+    references.take(0, again["t_us"].astype(np.int64), again)
+    assert stream.shown == {"world/goal/0": [], "world/goal/1": [first]}, "the other agent still has it"
+    again["mission_t_s"] += 1.0
+    again["ref_pos_ned_m"] = other
+    references.take(0, again["t_us"].astype(np.int64), again)
+    assert stream.shown == {"world/goal/0": [other], "world/goal/1": [first]}
