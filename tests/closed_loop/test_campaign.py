@@ -108,7 +108,7 @@ def test_scenario_events_happen_in_flight() -> None:
 @pytest.mark.process
 def test_a_killed_campaign_resumes(tmp_path: Path) -> None:
     asked = ["--scenario", "swap", "--agents", "2", "--protections", "off", "--jobs", "2", "--out", str(tmp_path)]
-    command = [sys.executable, "-m", "swarmctl", "campaign", *asked, "--trials", "50"]
+    command = [sys.executable, str(ROOT / "tools" / "campaign.py"), *asked, "--trials", "50"]  # as other programs do
     campaign = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
     children: list[psutil.Process] = []
     try:
