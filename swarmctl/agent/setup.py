@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pydantic import Field
 
-from swarmctl.agent.path_sharing import PathSharingParams
+from swarmctl.agent.sharing.path_sharing import PathSharingParams
 from swarmctl.control.collision.barrier import BarrierParams
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import CommitParams

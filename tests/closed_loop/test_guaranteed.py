@@ -15,9 +15,9 @@ from sitl.studies.campaign.events import Freeze, ScenarioEvent, Split
 from sitl.studies.campaign.flight import TrialFlight, drawn
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
-from swarmctl.agent import coordination
-from swarmctl.agent.coordination import Coordination
-from swarmctl.agent.separation_policy import Guaranteed
+from swarmctl.agent.planning import coordination
+from swarmctl.agent.planning.coordination import Coordination
+from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import agent_name
 from swarmctl.config import load

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from swarmctl.agent.coordination import Coordination
-from swarmctl.agent.separation_policy import Guaranteed
-from swarmctl.agent.world_model import WorldModel
+from swarmctl.agent.planning.coordination import Coordination
+from swarmctl.agent.planning.separation_policy import Guaranteed
+from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus.path_messages import decode_path, encode_path
 from swarmctl.bus.peers import PeerPaths, agent_name
 from swarmctl.bus.senders import SenderVerifier

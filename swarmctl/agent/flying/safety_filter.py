@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from swarmctl.agent.world_model import WorldModel
+from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.control.collision.barrier import Barrier, BarrierParams
 from swarmctl.control.estimation.disturbance import Estimate
 from swarmctl.control.model import VehicleModelParams

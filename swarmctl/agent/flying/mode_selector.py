@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from swarmctl.agent.alerts import Alerts
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.agent.telemetry_publisher import PlanningResult
+from swarmctl.agent.tick_results import PlanningResult
+from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.fallback import brake_and_hold_plan
 from swarmctl.control.mpc.plan_buffer import PlanBuffer

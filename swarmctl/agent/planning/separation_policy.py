@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from swarmctl.agent.coordination import Coordination
-from swarmctl.agent.world_model import WorldModel
+from swarmctl.agent.planning.coordination import Coordination
+from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOut, KeepOuts
 from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.core.trajectory import Times, Trajectory

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from swarmctl.agent.world_model import WorldModel
+from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.commitment_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.bus.peers import Bus, agent_name

@@ -5,58 +5,24 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from swarmctl.agent.alerts import Alert
+from swarmctl.agent.ports import TickSink
+from swarmctl.agent.tick_results import ControlOutput, PlanningResult
+from swarmctl.agent.watches.alerts import Alert
 from swarmctl.bus import topics
 from swarmctl.bus.json_messages import MAX_REASON, AnswerMessage, StatusMessage, encode_message
 from swarmctl.bus.peers import Bus, PeerPaths
-from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.estimation.disturbance import Estimate
-from swarmctl.control.mpc.problem import Start
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.core.clock import Clock
 from swarmctl.core.operator_verbs import Answer
 from swarmctl.core.records import pack_tick, tick_row
 from swarmctl.core.tick_record import TickRecord, TickTiming
-from swarmctl.core.types import AttitudeSetpoint, Mode, Plan, Reference, VehicleState
+from swarmctl.core.types import VehicleState
 from swarmctl.mavlink.autopilot import Autopilot
 
 _STATUS_EVERY_US = 200_000
 _RECENT_TICKS = 250
-
-
-class TickSink(Protocol):
-    """Destination of ticks and events; its methods never block."""
-
-    def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
-        """Take the row of a tick, a (1,) array of `core.records.TICK_DTYPE`."""
-
-    def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None: ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlanningResult:
-    """Result of the planning part of a tick; all but `keep_outs` is None while the own state is stale."""
-
-    start: Start | None
-    plan: Plan | None  # also None while the autopilot flies
-    reference: Reference | None  # the mission's reference now, one point
-    keep_outs: list[KeepOut]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ControlOutput:
-    """Output of a tick: mode, flown plan and setpoint sent."""
-
-    mode: Mode
-    flown: Plan | None
-    setpoint: AttitudeSetpoint | None
-    safety_filter_acted: bool = False
 
 
 class TelemetryPublisher:
