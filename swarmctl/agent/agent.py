@@ -72,32 +72,33 @@ class Agent:
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
 
     def _make_senses(self, setup: AgentSetup) -> None:
-        """Make what receives, senses and watches, and the state machine."""
+        """Make what receives, senses and watches, and the state mission."""
         ports, alerts = self._ports, self._alerts
         self._vehicle_setup = make_vehicle_setup(setup, ports)
         self._world_model = make_world_model(setup, ports)
         self._own_state = OwnState(setup.vehicle_model, make_estimator(setup))
         self._state_machine = make_state_machine(setup)
+        self._mission = self._state_machine.mission
         self._vehicle_watch = VehicleWatch(ports, alerts)
         self._controller_watch = ControllerWatch(ports.note)
         self._deadlines = DeadlineWatch(setup.params.overload, setup.params.rate_hz, alerts, ports.note)
         self._orders = OperatorOrders(setup, ports, self._world_model, self._state_machine, alerts=alerts)
-        self._start_conditions = StartConditions(setup, self._state_machine, alerts)
-        self._mission_end = MissionEnd(ports, self._state_machine, self._vehicle_setup, alerts)
+        self._start_conditions = StartConditions(setup, self._mission, alerts)
+        self._mission_end = MissionEnd(ports, self._mission, self._vehicle_setup, alerts)
 
     def _make_flight(self, setup: AgentSetup) -> None:
         """Make what plans, decides, acts and shares."""
-        ports, alerts, own_state, machine = self._ports, self._alerts, self._own_state, self._state_machine
+        ports, alerts, own_state, mission = self._ports, self._alerts, self._own_state, self._mission
         controller, transit = make_controllers(setup, ports.stopwatch_ns)
         self._separation = make_separation_policy(setup, ports, self._world_model)
-        references = make_reference_selector(setup, ports, machine, controller, own_state.delay_us)
-        self._modes = ModeSelector(setup, controller, own_state.delay_us, machine, alerts=alerts, note=ports.note)
+        references = make_reference_selector(setup, ports, mission, controller, own_state.delay_us)
+        self._modes = ModeSelector(setup, controller, own_state.delay_us, mission, alerts=alerts, note=ports.note)
         self._planner = Planner(
             setup,
             ports,
             self._world_model,
             own_state,
-            machine,
+            mission,
             references=references,
             separation=self._separation,
             modes=self._modes,
@@ -124,12 +125,12 @@ class Agent:
     @property
     def outcome(self) -> str:
         """ "completed", or the reason why the mission was not."""
-        return self._state_machine.outcome or "stopped before the mission began"
+        return self._mission.outcome or "stopped before the mission began"
 
     @property
     def has_armed(self) -> bool:
         """Whether arming has been requested; a mission that ends before that counts as one that could not start."""
-        return self._state_machine.arming.requested
+        return self._mission.arming.requested
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -188,7 +189,7 @@ class Agent:
             ControlOutput(
                 mode=self._modes.mode, flown=flown, setpoint=setpoint, safety_filter_acted=self._safety_filter.acts
             ),
-            state_machine=self._state_machine,
+            mission=self._mission,
             estimate=self._own_state.estimate,
             deadline_misses=deadline_misses,
             timing=self.timing,
@@ -229,7 +230,7 @@ class Agent:
         self._vehicle_watch.report_text()
         self._vehicle_watch.report_jump(now_us)
         if state is not None:
-            self._own_state.update(state, autopilot.hover_thrust_01, controls=self._state_machine.had_control)
+            self._own_state.update(state, autopilot.hover_thrust_01, controls=self._mission.had_control)
         return state
 
     def _decide(self, now_us: int, state: VehicleState | None, planning: PlanningResult) -> Plan | None:
@@ -277,26 +278,26 @@ class Agent:
 
     def _advance(self, now_us: int, state: VehicleState | None) -> None:
         """Advance the mission, and request from the autopilot what its phase needs."""
-        machine = self._state_machine
-        controlled = machine.had_control
-        for command in machine.step(self._phase_inputs(now_us, state)):
+        mission = self._mission
+        controlled = mission.had_control
+        for command in self._state_machine.step(self._phase_inputs(now_us, state)):
             self._ports.commands.request(command)
-        if machine.pilot_override:
-            self._alerts.put("override", machine.outcome, now_us)
+        if mission.pilot_override:
+            self._alerts.put("override", mission.outcome, now_us)
         self._start_conditions.report(now_us)
         self._mission_end.step(now_us)
         self._vehicle_setup.step(now_us)
-        if machine.had_control and not controlled:
+        if mission.had_control and not controlled:
             self._own_state.reset()
             self._planner.reset()
-        now = (machine.phase, self._modes.mode, self._ports.autopilot.mode)
+        now = (mission.phase, self._modes.mode, self._ports.autopilot.mode)
         if now != self._announced:
             self._announced = now
             names = {"phase": now[0].name, "mode": now[1].name, "flight_mode": now[2].name}
             self._ports.note("state", **names, reason=self._modes.decision.reason)
 
     def _phase_inputs(self, now_us: int, state: VehicleState | None) -> PhaseInputs:
-        autopilot, directive, phase = self._ports.autopilot, self._planner.directive, self._state_machine.phase
+        autopilot, directive, phase = self._ports.autopilot, self._planner.directive, self._mission.phase
         utc_us = self._ports.clock.utc_us()
         return PhaseInputs(
             now_us=now_us,

@@ -19,6 +19,7 @@ from swarmctl.control.controllers.discovery import ControllerParams, make_contro
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.estimation.state_filter import StateFilter
+from swarmctl.control.phases.mission_state import MissionSetup, MissionState
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.trajectory import grid
@@ -139,11 +140,11 @@ def make_safety_filter(setup: AgentSetup, ports: Ports, world_model: WorldModel)
 
 
 def make_reference_selector(
-    setup: AgentSetup, ports: Ports, state_machine: MissionStateMachine, controller: Controller, delay_us: int
+    setup: AgentSetup, ports: Ports, mission: MissionState, controller: Controller, delay_us: int
 ) -> ReferenceSelector:
     """Return what selects the reference of plans, which begin `delay_us` from now, where a setpoint acts."""
     ahead_s = delay_us * 1e-6 + controller.dt_us * 1e-6 * grid(controller.longest)  # (longest+1,)
-    return ReferenceSelector(setup, state_machine, ahead_s, ports.note)
+    return ReferenceSelector(setup, mission, ahead_s, ports.note)
 
 
 def make_telemetry_publisher(
@@ -167,14 +168,14 @@ def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
     """Return the state machine of the agent's mission."""
     budget = setup.separation.budget
     reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, budget.planned_m)
-    return MissionStateMachine(
-        setup.params.state_machine,
-        setup.agent,
-        len(setup.peers),
-        budget.landing_m(setup.params.state_machine.apart_m),
+    mission = MissionSetup(
+        agent=setup.agent,
+        peers=len(setup.peers),
+        landing_m=budget.landing_m(setup.params.state_machine.apart_m),
         start_ned_m=setup.starts_ned_m[setup.agent],
         duration_s=setup.mission.duration_s,
         reference=reference,
         contains=lambda at_ne_m: not setup.fence_ne_m or is_inside(at_ne_m, setup.fence_ne_m),
         volume=setup.volume,
     )
+    return MissionStateMachine(setup.params.state_machine, mission)

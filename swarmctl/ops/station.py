@@ -18,7 +18,7 @@ from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import OBSTACLES, STATUS, TICK
 from swarmctl.config import Config, own_identity
-from swarmctl.control.phases.state_machine import OPERATOR_STOP
+from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.records import unpack_tick
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError

@@ -7,8 +7,10 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.control.phases import failsafe, state_machine
-from swarmctl.control.phases.state_machine import REBOOTED, MissionStateMachine
+from swarmctl.control.failsafe import decision
+from swarmctl.control.phases import handover
+from swarmctl.control.phases.mission_state import MissionState
+from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.core.types import Mode, Phase
 from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
@@ -23,12 +25,12 @@ STALE_FLOWN = Off(settings=("agent.failsafe.state_max_age_s=5",))
 ALWAYS_OURS = Off(  # neither the failsafe's table nor the state machine looks at who flies
     patches=(
         (
-            failsafe,
+            decision,
             "_TABLE",
-            tuple(row for row in failsafe._TABLE if row[0].__name__ not in ("_taken_over", "_overridden")),
+            tuple(row for row in decision._TABLE if row[0].__name__ not in ("_taken_over", "_overridden")),
         ),
-        (state_machine, "_is_under_other_control", lambda state: False),
-        (MissionStateMachine, "_override", lambda *_: None),
+        (handover, "is_under_other_control", lambda state: False),
+        (MissionState, "override", lambda *_: None),
     )
 )
 

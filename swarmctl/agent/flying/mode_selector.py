@@ -10,12 +10,12 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.tick_results import PlanningResult
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.controllers.kind import Controller
+from swarmctl.control.failsafe.decision import NOTHING_WORN, Escalation, FailsafeDecision, Response, decide, escalate
+from swarmctl.control.failsafe.endurance import Endurance
 from swarmctl.control.fallback import brake_and_hold_plan
 from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Start
-from swarmctl.control.phases.endurance import Endurance
-from swarmctl.control.phases.failsafe import NOTHING_WORN, Escalation, FailsafeDecision, Response, decide, escalate
-from swarmctl.control.phases.state_machine import MissionStateMachine
+from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.core.types import Array, FlightMode, Health, Landed, Mode, Phase, Plan, PlanStatus, VehicleState
 
 _NO_TIME_US = -1
@@ -28,7 +28,7 @@ class ModeSelector:
         setup: parameters of the agent.
         controller: its plans have the grid of those that replace them.
         delay_us: from sending a setpoint to when it acts.
-        state_machine: phase, and who has control.
+        mission: phase, and who has control.
         alerts: are told what becomes of the mission.
         note: receives the event `escalation` when that changes.
 
@@ -42,14 +42,14 @@ class ModeSelector:
         setup: AgentSetup,
         controller: Controller,
         delay_us: int,
-        state_machine: MissionStateMachine,
+        mission: MissionState,
         *,
         alerts: Alerts,
         note: Callable[..., None],
     ) -> None:
         self._params, self._lag, self._delay_us = setup.params.failsafe, setup.vehicle_model.lag(), delay_us
         self._dt_us, self._steps = controller.dt_us, controller.steps
-        self._state_machine, self._alerts, self._note = state_machine, alerts, note
+        self._mission, self._alerts, self._note = mission, alerts, note
         self._plan_buffer = PlanBuffer(setup.agent, self._dt_us, self._steps, setup.separation.brake_m_s2)
         self._certified_us: int | None = None
         self._hold_at: Array | None = None
@@ -128,18 +128,18 @@ class ModeSelector:
             last_good_plan_age_us=_NO_TIME_US if good is None else now_us + self._delay_us - good.t0_us,
             planless_us=0 if self._certified_us is None else now_us - self._certified_us,
             speed_m_s=0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
-            phase=self._state_machine.phase,
-            had_control=self._state_machine.had_control,
+            phase=self._mission.phase,
+            had_control=self._mission.had_control,
             battery_01=self._endurance.battery_01,
             link_lost_01=self._endurance.link_lost_01,
-            pilot_override=self._state_machine.pilot_override,
+            pilot_override=self._mission.pilot_override,
         )
 
     def _report(self, now_us: int, now: Escalation) -> None:
         before, self.escalation = self.escalation, now
         if now.response is not before.response:
             self._note("escalation", response=now.response.name, reason=now.reason)
-        if now.response is not Response.NONE and self._state_machine.phase < Phase.DONE:
+        if now.response is not Response.NONE and self._mission.phase < Phase.DONE:
             self._alerts.put("escalation", now.reason, now_us)
 
     def _brake_and_hold(self, start: Start, disturbance_ned_m_s2: Array) -> Plan:

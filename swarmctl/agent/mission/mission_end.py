@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from swarmctl.agent.ports import Ports
 from swarmctl.agent.watches.alerts import Alerts
-from swarmctl.control.phases.state_machine import MissionStateMachine
+from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
 _RESTORE_TIMEOUT_US = 5_000_000  # longest wait for parameters to be restored before the process ends
@@ -15,15 +15,13 @@ class MissionEnd:
 
     Args:
         ports: time; receives the event `parameters_left_changed`.
-        state_machine: knows whether the mission has ended.
+        mission: knows whether the mission has ended.
         vehicle_setup: has changed the parameters.
         alerts: are told of parameters that are left changed.
     """
 
-    def __init__(
-        self, ports: Ports, state_machine: MissionStateMachine, vehicle_setup: VehicleSetup, alerts: Alerts
-    ) -> None:
-        self._ports, self._state_machine, self._vehicle_setup = ports, state_machine, vehicle_setup
+    def __init__(self, ports: Ports, mission: MissionState, vehicle_setup: VehicleSetup, alerts: Alerts) -> None:
+        self._ports, self._mission, self._vehicle_setup = ports, mission, vehicle_setup
         self._alerts = alerts
         self._ended_us: int | None = None
 
@@ -36,7 +34,7 @@ class MissionEnd:
 
     def step(self, now_us: int) -> None:
         """Advance by one tick."""
-        if not self._state_machine.finished:
+        if not self._mission.finished:
             return
         if self._ended_us is None:
             self._ended_us = now_us

@@ -48,7 +48,7 @@ class OperatorOrders:
             self._ports.note("order_refused", verb=order.verb, reason=refusal, **order.arguments)
             return refusal
         self._ports.note("operator", verb=order.verb, **order.arguments)
-        offered = self._state_machine.offered
+        offered = self._state_machine.mission.offered
         if order.verb == MISSION and offered is not None:
             self._ports.note("mission_changed", duration_s=offered.duration_s, mission=offered.text)
         return ""
@@ -67,5 +67,5 @@ class OperatorOrders:
         offered = self._missions.offer(order, self._ports.clock.utc_us())
         if isinstance(offered, str):
             return offered
-        self._state_machine.offered = offered
+        self._state_machine.mission.offered = offered
         return ""

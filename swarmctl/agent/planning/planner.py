@@ -21,7 +21,7 @@ from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOuts
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.mpc.problem import Problem, Start
-from swarmctl.control.phases.state_machine import MissionStateMachine
+from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.core.types import Mode, Phase, Plan, Reference, VehicleState
 
 # modes in which the vehicle does not follow its committed trajectory
@@ -36,7 +36,7 @@ class Planner:
         ports: time; receives the events of the flight volume.
         world_model: what to keep clear of.
         own_state: where plans begin.
-        state_machine: phase, and who has control.
+        mission: phase, and who has control.
         references: what plans follow.
         separation: keeps the agent apart from its peers.
         modes: mode of the newest tick, and the certified plan to linearise around.
@@ -55,7 +55,7 @@ class Planner:
         ports: Ports,
         world_model: WorldModel,
         own_state: OwnState,
-        state_machine: MissionStateMachine,
+        mission: MissionState,
         *,
         references: ReferenceSelector,
         separation: SeparationPolicy,
@@ -65,7 +65,7 @@ class Planner:
         alerts: Alerts,
     ) -> None:
         self._clock, self._utc_of_us, self._alerts = ports.clock, ports.utc_of_us, alerts
-        self._world_model, self._own_state, self._state_machine = world_model, own_state, state_machine
+        self._world_model, self._own_state, self._mission = world_model, own_state, mission
         self._references, self._separation, self._modes = references, separation, modes
         self.controller, self._transit = controller, transit
         self.directive = SeparationDirective()
@@ -80,11 +80,11 @@ class Planner:
             # the autopilot flies the vehicle, on stale setpoints or by its failsafe
             self.directive = self._separation.wait(self._clock.utc_us(), state)
             return PlanningResult(start=None, plan=None, reference=None, keep_outs=[])
-        machine = self._state_machine
-        start = self._own_state.start(state, now_us + self._own_state.delay_us, controls=machine.had_control)
+        mission = self._mission
+        start = self._own_state.start(state, now_us + self._own_state.delay_us, controls=mission.had_control)
         keep_outs = self._keep_outs(state, start)
-        flies = Phase.GOTO_START <= machine.phase <= Phase.GOTO_LAND
-        controls = flies and machine.had_control
+        flies = Phase.GOTO_START <= mission.phase <= Phase.GOTO_LAND
+        controls = flies and mission.had_control
         if outside := self._volume_watch.update(now_us, state, controls):
             self._alerts.put("volume", outside, now_us)
         self._references.look_ahead(now_us, self._clock.utc_us())
@@ -105,7 +105,7 @@ class Planner:
             self._utc_of_us(start.t_us),
             self.controller.dt_us,
             self.controller.steps,
-            phase=self._state_machine.phase,
+            phase=self._mission.phase,
         )
         return self._encounters.noted(near, start.pos_ned_m)
 
@@ -128,7 +128,7 @@ class Planner:
             SeparationInputs(
                 utc_us=utc_us,
                 state=state,
-                phase=self._state_machine.phase,
+                phase=self._mission.phase,
                 desired=self._references.desired(now_us, utc_us),
                 horizon_utc_us=utc_us + self._horizon_us,
                 keep_outs=keep_outs,
@@ -141,7 +141,7 @@ class Planner:
         directive = self.directive
         if directive.alert:
             self._alerts.put("separation", directive.alert, now_us)
-        controller = self.controller if self._state_machine.phase is Phase.TRACK else self._transit
+        controller = self.controller if self._mission.phase is Phase.TRACK else self._transit
         return controller.plan(
             Problem(
                 start=start,

@@ -10,7 +10,7 @@ import numpy as np
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.commit.trajectory_planner import DesiredReference
-from swarmctl.control.phases.state_machine import MissionStateMachine
+from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.control.reference.deadlock import Deadlock, DeadlockRecovery
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, Phase, Reference, Sampled
@@ -21,15 +21,13 @@ class ReferenceSelector:
 
     Args:
         setup: parameters of the agent.
-        state_machine: source of the mission's reference.
+        mission: source of the mission's reference.
         ahead_s: (N,) times from now of the references that are asked for.
         note: receives the event `deadlock` when one begins and when it ends.
     """
 
-    def __init__(
-        self, setup: AgentSetup, state_machine: MissionStateMachine, ahead_s: Array, note: Callable[..., None]
-    ) -> None:
-        self._state_machine, self._note, self._yaw_rad = state_machine, note, setup.mission.yaw_rad
+    def __init__(self, setup: AgentSetup, mission: MissionState, ahead_s: Array, note: Callable[..., None]) -> None:
+        self._mission, self._note, self._yaw_rad = mission, note, setup.mission.yaw_rad
         self._recovery = DeadlockRecovery(
             setup.params.deadlock, setup.agent, setup.separation.budget.radius_m, setup.volume
         )
@@ -41,16 +39,16 @@ class ReferenceSelector:
         """Return the heading [rad] to turn to: the operator's, the mission's while it is followed, or that of the
         configuration before and after it; None while the mission is interrupted: the present one.
         """
-        asked_rad = self._state_machine.yaw_rad
+        asked_rad = self._mission.yaw_rad
         if asked_rad is None:
-            asked_rad = self._state_machine.mission_yaw_rad(utc_us)
-        if asked_rad is None and self._state_machine.phase is not Phase.TRACK:
+            asked_rad = self._mission.mission_yaw_rad(utc_us)
+        if asked_rad is None and self._mission.phase is not Phase.TRACK:
             return self._yaw_rad
         return asked_rad
 
     def look_ahead(self, now_us: int, utc_us: int) -> None:
         """Take in what the mission asks for from this tick on."""
-        self._mission_ned = self._state_machine.reference(utc_us, now_us, self._now_and_ahead_s)
+        self._mission_ned = self._mission.reference(utc_us, now_us, self._now_and_ahead_s)
 
     def update(
         self,
@@ -69,7 +67,7 @@ class ReferenceSelector:
             known: regions to keep out of.
             landmarks: returns the obstacles seen so far, which a detour leads around.
         """
-        wanted_ned_m, mission = self._mission_ned[0][0], self._mission(now_us, utc_us)
+        wanted_ned_m, mission = self._mission_ned[0][0], self._follows(now_us, utc_us)
         self._recovery.step(now_us, pos_ned_m, wanted_ned_m, mission, known, obstacles=landmarks)
         return self._report(now_us)
 
@@ -84,7 +82,7 @@ class ReferenceSelector:
         The mission's own one is that which agents share, without the own place around it.
         """
         pos, vel = self._mission_ned
-        now_ref = Reference(pos[:1] - self._state_machine.place_offset_ned_m, vel[:1], self._yaw_rad)
+        now_ref = Reference(pos[:1] - self._mission.place_offset_ned_m, vel[:1], self._yaw_rad)
         if self._recovery.active:
             return Reference(*self._recovery.sample(self._ahead_s), self._yaw_rad), now_ref
         return Reference(pos[1:], vel[1:], self._yaw_rad), now_ref
@@ -93,10 +91,10 @@ class ReferenceSelector:
         """Return the same reference as a function of time, for a planner with another time grid."""
         if self._recovery.active:
             return DesiredReference(self._recovery.sample, follows_path=True)
-        return DesiredReference(self._mission(now_us, utc_us))
+        return DesiredReference(self._follows(now_us, utc_us))
 
-    def _mission(self, now_us: int, utc_us: int) -> Sampled:
-        return partial(self._state_machine.reference, utc_us, now_us)
+    def _follows(self, now_us: int, utc_us: int) -> Sampled:
+        return partial(self._mission.reference, utc_us, now_us)
 
     def _report(self, now_us: int) -> Deadlock | None:
         reported, self._reported = self._reported, self._recovery.deadlock

@@ -13,7 +13,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.json_messages import MAX_REASON, AnswerMessage, StatusMessage, encode_message
 from swarmctl.bus.peers import Bus, PeerPaths
 from swarmctl.control.estimation.disturbance import Estimate
-from swarmctl.control.phases.state_machine import MissionStateMachine
+from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.core.clock import Clock
 from swarmctl.core.operator_verbs import Answer
 from swarmctl.core.records import pack_tick, tick_row
@@ -65,7 +65,7 @@ class TelemetryPublisher:
         planning: PlanningResult,
         output: ControlOutput,
         *,
-        state_machine: MissionStateMachine,
+        mission: MissionState,
         estimate: Estimate,
         deadline_misses: int,
         timing: TickTiming,
@@ -77,7 +77,7 @@ class TelemetryPublisher:
             state,
             planning,
             output,
-            state_machine=state_machine,
+            mission=mission,
             estimate=estimate,
             deadline_misses=deadline_misses,
             timing=timing,
@@ -88,7 +88,7 @@ class TelemetryPublisher:
         self._bus.publish(topics.TICK, pack_tick(row, record.flown))
         if now_us - self._status_us >= _STATUS_EVERY_US:
             self._status_us = now_us
-            self._bus.publish(topics.STATUS, encode_message(self._status(record, state_machine)))
+            self._bus.publish(topics.STATUS, encode_message(self._status(record, mission)))
         return record
 
     def answer(self, answer: Answer) -> None:
@@ -111,7 +111,7 @@ class TelemetryPublisher:
         planning: PlanningResult,
         output: ControlOutput,
         *,
-        state_machine: MissionStateMachine,
+        mission: MissionState,
         estimate: Estimate,
         deadline_misses: int,
         timing: TickTiming,
@@ -122,8 +122,8 @@ class TelemetryPublisher:
             t_us=now_us,
             utc_us=utc_us,
             seq=self.seq,
-            mission_t_s=state_machine.mission_t_s(utc_us),
-            phase=state_machine.phase,
+            mission_t_s=mission.mission_t_s(utc_us),
+            phase=mission.phase,
             mode=output.mode,
             flight_mode=self._autopilot.mode,
             armed=self._autopilot.armed,
@@ -159,7 +159,7 @@ class TelemetryPublisher:
         ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
         return peers, obstacles, max(ages_ms, default=math.nan)
 
-    def _status(self, record: TickRecord, state_machine: MissionStateMachine) -> StatusMessage:
+    def _status(self, record: TickRecord, mission: MissionState) -> StatusMessage:
         state, reference, error_m = record.state, record.reference, math.nan
         health, received_us, alert = self._autopilot.health, self._autopilot.received_us, self.active_alert
         if state is not None and reference is not None:
@@ -174,8 +174,8 @@ class TelemetryPublisher:
             flight_mode=int(record.flight_mode),
             armed=record.armed,
             landed=int(self._autopilot.landed),
-            held=state_machine.held,
-            control=state_machine.control_mode(record.mode),
+            held=mission.held,
+            control=mission.control_mode(record.mode),
             altitude_m=0.0 if state is None else -float(state.pos_ned_m[2]),
             ground_speed_m_s=-1.0 if state is None else math.hypot(*state.vel_ned_m_s[:2].tolist()),
             battery_01=_known(health.battery_01),
@@ -183,10 +183,10 @@ class TelemetryPublisher:
             gps_fix=-1 if health.gps_fix is None else health.gps_fix,
             satellites=-1 if health.satellites is None else health.satellites,
             link_age_ms=-1.0 if received_us is None else (record.t_us - received_us) * 1e-3,
-            ready_utc_us=state_machine.ready_utc_us,
+            ready_utc_us=mission.ready_utc_us,
             mission_t_s=_finite(record.mission_t_s),
-            ends_in_s=_finite(state_machine.ends_in_s(record.t_us, record.utc_us)),
-            outcome=state_machine.outcome,
+            ends_in_s=_finite(mission.ends_in_s(record.t_us, record.utc_us)),
+            outcome=mission.outcome,
             position_error_m=_finite(error_m),
             separation_m=_finite(record.nearest_peer_m),
             tick_p99_ms=percentile_99(self._recent_ms),

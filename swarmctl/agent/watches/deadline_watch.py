@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from swarmctl.agent.watches.alerts import Alerts
-from swarmctl.control.phases.overload import Level, Overload, OverloadParams, SetpointStops
+from swarmctl.control.failsafe.overload import Level, Overload, OverloadParams, SetpointStops
 
 _SETPOINT_LOSS_S = 0.5  # time without setpoints after which an autopilot takes over, until it has told its own
 

@@ -34,7 +34,7 @@ from swarmctl.check.services import corners_deg, has_fence
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import _drawn, as_json, print_check
 from swarmctl.config import Config, load
-from swarmctl.control.phases.failsafe import FailsafeParams
+from swarmctl.control.failsafe.decision import FailsafeParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.types import FlightMode, Landed
 from swarmctl.core.verdict import Verdict
