@@ -15,12 +15,12 @@ from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock
 from swarmctl.core.types import GeoOrigin
-from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import AUTOPILOT_COMPID, Codec
 from swarmctl.mavlink.commands import OWN_COMPID, CommandPort
 from swarmctl.mavlink.signing.channel import SigningChannel
 from swarmctl.mavlink.signing.signed_transport import SignedTransport
 from swarmctl.mavlink.transport import Transport
+from swarmctl.mavlink.vehicle.autopilot import Autopilot
 
 
 def make_agent(

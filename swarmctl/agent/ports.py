@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.core.clock import Clock
 from swarmctl.core.types import Plan
-from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.commands import CommandPort
+from swarmctl.mavlink.vehicle.autopilot import Autopilot
 
 
 class TickSink(Protocol):

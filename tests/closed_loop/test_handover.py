@@ -18,10 +18,10 @@ from swarmctl.control.phases import handover, obeyed_orders
 from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
 from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.core.types import FlightMode, Phase, VehicleState
-from swarmctl.mavlink import mode_watch
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import PipeTransport
+from swarmctl.mavlink.vehicle import mode_watch
 from tests.closed_loop.conftest import Fly, closer_than, mission_t_s
 
 SETPOINT = 82  # SET_ATTITUDE_TARGET

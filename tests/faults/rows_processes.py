@@ -153,7 +153,7 @@ ROWS = (
         script=simulator_started_again,
         off=in_program(
             "agent",
-            "import swarmctl.mavlink.vehicle_clock as it\n"
+            "import swarmctl.mavlink.vehicle.vehicle_clock as it\n"
             "it.VehicleClock.boots = property(lambda self: 0, lambda self, count: None)",
         ),
     ),

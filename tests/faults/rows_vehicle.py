@@ -12,10 +12,10 @@ from swarmctl.control.phases import handover
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.core.types import Mode, Phase
-from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.local_frame import LocalFrame
-from swarmctl.mavlink.vehicle_clock import VehicleClock
+from swarmctl.mavlink.vehicle.local_frame import LocalFrame
+from swarmctl.mavlink.vehicle.state_samples import StateSamples
+from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 from tests.closed_loop.conftest import COARSE
 from tests.faults.row import Off
 from tests.faults.rows_agents import lands
@@ -86,12 +86,12 @@ def _unchecked(codec: Codec, frame: bytes) -> bytes | None:
     return bytes(frame[10 : 10 + frame[1]]).ljust(size, b"\0")[:size]
 
 
-def _as_it_comes(self: Autopilot, vehicle_us: int, arrived_us: int, *values: Any, **more: Any) -> bool:
+def _as_it_comes(self: StateSamples, vehicle_us: int, arrived_us: int, *values: Any, **more: Any) -> bool:
     """Take a state for as new as its arrival."""
     return _TAKE(self, arrived_us, arrived_us, *values, **more)
 
 
-_TAKE = Autopilot._take
+_TAKE = StateSamples._take
 FROM_THE_GROUND = (*COARSE, "swarm.agents=2", "start.spacing_m=4", "mission.kind=line", "mission.duration_s=60")
 MOBILE = (*SWAP, "sitl.battery.capacity_mah=3000", "agent.failsafe.window_s=1")
 
@@ -157,7 +157,7 @@ ROWS = (
         ),
         reacts=lambda scene: scene.since_s > 7.5,
         lasts_s=8.0,
-        off=Off(patches=((Autopilot, "_take", _as_it_comes),)),
+        off=Off(patches=((StateSamples, "_take", _as_it_comes),)),
     ),
     SimulatedRow(
         name="link-corrupt",

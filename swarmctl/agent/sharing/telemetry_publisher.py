@@ -19,7 +19,7 @@ from swarmctl.core.operator_verbs import Answer
 from swarmctl.core.records import pack_tick, tick_row
 from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import VehicleState
-from swarmctl.mavlink.autopilot import Autopilot
+from swarmctl.mavlink.vehicle.autopilot import Autopilot
 
 _STATUS_EVERY_US = 200_000
 _RECENT_TICKS = 250

@@ -45,10 +45,10 @@ class VehicleWatch:
 
     def report_gap(self, now_us: int, cause: str) -> None:
         """Report that setpoints had stopped for too long, if they had; the cause is "" where it is not known."""
-        autopilot = self._ports.autopilot
-        if autopilot.gaps == self._gaps:
+        sent = self._ports.autopilot.setpoints
+        if sent.gaps == self._gaps:
             return
-        self._gaps, gap_s = autopilot.gaps, autopilot.gap_s
+        self._gaps, gap_s = sent.gaps, sent.gap_s
         stopped = cause or f"setpoints had stopped for {gap_s:.2f} s"
         self._alerts.put("gap", f"{stopped}: the autopilot's failsafe may have acted", now_us)
         self._ports.note("setpoint_gap", seconds=gap_s)

@@ -16,10 +16,10 @@ from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import AttitudeSetpoint, FlightMode, GeoOrigin, Landed
-from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.transport import PipeTransport, pipe_pair
-from swarmctl.mavlink.vehicle_clock import VehicleClock
+from swarmctl.mavlink.vehicle.autopilot import Autopilot
+from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 
 SHARED = GeoOrigin(47.397742, 8.545594, 489.4)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -432,7 +432,7 @@ def test_a_setpoint_that_would_harm_never_leaves(bad: AttitudeSetpoint, why: str
     assert why in bench.pilot.send(bad, 0)
     assert sent(bench.vehicle) == []
     assert bench.frames == []
-    assert bench.pilot.refused_setpoints == 1
+    assert bench.pilot.setpoints.refused == 1
 
 
 @pytest.mark.parametrize("thrust_01", [0.0, 1.0])
@@ -556,7 +556,7 @@ def test_a_setpoint_gap_in_which_the_failsafe_may_have_acted_is_counted() -> Non
         bench.heartbeat()
         bench.poll()
         bench.pilot.send(setpoint(valid_until_us=bench.clock.now_us() + 100_000), bench.clock.now_us())
-        return bench.pilot.gaps, round(bench.pilot.gap_s, 2)
+        return bench.pilot.setpoints.gaps, round(bench.pilot.setpoints.gap_s, 2)
 
     assert stream_after(5.0) == (0, 0.0)
     assert stream_after(0.45) == (0, 0.0)

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.types import GeoOrigin
-from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec, heartbeat_of
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.latch import anybody
@@ -39,6 +38,7 @@ from swarmctl.mavlink.signing.signature import (
 )
 from swarmctl.mavlink.signing.signed_transport import SignedTransport
 from swarmctl.mavlink.transport import UdpTransport, bind_udp, pipe_pair
+from swarmctl.mavlink.vehicle.autopilot import Autopilot
 
 SYSID = 3
 SECRET, OTHER_SECRET = bytes(range(32)), bytes(range(1, 33))

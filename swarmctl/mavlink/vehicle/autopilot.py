@@ -7,8 +7,6 @@ state, and therefore no setpoint is sent.
 
 from __future__ import annotations
 
-import math
-import struct
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.core.frames import numbers_rotated_to_ned
 from swarmctl.core.text import printable
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
 from swarmctl.mavlink.codec import Codec, message_of
@@ -25,23 +22,19 @@ from swarmctl.mavlink.dialects.dialect import LAST_INTEGER_TYPE, Dialect
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.fields import BOOT_READERS, READERS
 from swarmctl.mavlink.framing import frames, message_id
-from swarmctl.mavlink.local_frame import LocalFrame
-from swarmctl.mavlink.mode_watch import ModeWatch
-from swarmctl.mavlink.plausibility import state_problem
-from swarmctl.mavlink.sample import Placed, Quaternion, Sample, Vector
 from swarmctl.mavlink.signing.refusals import FrameRefusals
 from swarmctl.mavlink.transport import Transport
-from swarmctl.mavlink.vehicle_clock import VehicleClock
-from swarmctl.mavlink.vehicle_health import VehicleHealth
+from swarmctl.mavlink.vehicle.local_frame import LocalFrame
+from swarmctl.mavlink.vehicle.mode_watch import ModeWatch
+from swarmctl.mavlink.vehicle.setpoint_stream import SetpointStream
+from swarmctl.mavlink.vehicle.state_samples import StateSamples
+from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
+from swarmctl.mavlink.vehicle.vehicle_health import VehicleHealth
 
-_ATTITUDE_ONLY = 7  # type_mask that ignores body rates; with mask 0 rate and attitude setpoints would compete
 _ARMED_FLAG = 128
 _CRITICAL = 5
 _PREARM = 1 << 28
-_LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
-_BODY_FRD = (mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_FRD)  # frames of the velocity in ODOMETRY
 _LOCAL_POSITION = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED  # its time stamps are those of the state
-_SETPOINT = struct.Struct("<I4f3ff3B")  # SET_ATTITUDE_TARGET, without the thrust of other axes
 _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
 _HOVER_M_S = 0.2
@@ -75,11 +68,11 @@ class Autopilot:
         armed_told_us: arrival time of the HEARTBEAT that reported `armed`, host clock; -1 before the first.
         hover_thrust_01: thrust with which the autopilot hovers by itself; until observed, the value of its parameter.
         pos_accuracy_m: reported horizontal accuracy, 1 sigma; None while unreported.
-        samples: number of states received; two readings give the rate.
+        states: the newest; `states.count`: how many were received; two readings give the rate.
         received_us: arrival time of the last frame, host clock.
         invalid: number of polls without a state although a sample existed, by reason.
         watch: the vehicle's flight mode and failsafe, and whether they are in doubt.
-        gaps: number of setpoint gaps so long that the autopilot's failsafe may have acted unseen; `gap_s`: the newest.
+        setpoints: what it has been sent.
         health: battery and GPS.
     """
 
@@ -87,11 +80,6 @@ class Autopilot:
     whole_params: set[str]
     hover_thrust_01: float | None
     pos_accuracy_m: float | None
-    _sample: Sample | None
-    _placed: Placed | None
-    _attitude: tuple[Quaternion, Vector] | None  # with its rates
-    _reset_counter: int | None
-    _was_reset: bool  # the estimator has reported a reset since the newest placed sample
 
     def __init__(
         self,
@@ -113,22 +101,19 @@ class Autopilot:
         self.dialect: Dialect | None = None
         self.armed, self.armed_told_us = False, -1
         self._texts: deque[AutopilotText] = deque(maxlen=_MOST_TEXTS)
-        self.refused_setpoints = self.samples = 0
         self.received_us: int | None = None
         self.invalid: Counter[str] = Counter()
-        self.gaps, self.gap_s = 0, 0.0
-        self._departures = 0  # count of departures from the external mode at the newest setpoint
-        self._setpoint_us: int | None = None
         self._sync_us = 0
         self._syncs: deque[int] = deque(maxlen=16)  # host times of unanswered TIMESYNC requests [ns]
-        self._boots = self._restarts = 0  # counters of the clock that have been handled
+        self.setpoints = SetpointStream(codec, sysid, self.send_frame)
+        self.states = StateSamples(self.clock, self.frame, codec.refused, self._forget)
         self._forget()
         self._handlers: dict[int, Callable[[Any, int], None]] = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
             mavlink.MAVLINK_MSG_ID_CURRENT_MODE: self._current_mode,
-            mavlink.MAVLINK_MSG_ID_ODOMETRY: self._odometry,
-            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._attitude_quaternion,
-            _LOCAL_POSITION: self._local_position,
+            mavlink.MAVLINK_MSG_ID_ODOMETRY: self.states.odometry,
+            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self.states.attitude_quaternion,
+            _LOCAL_POSITION: self.states.local_position,
             mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position,
             mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: self._origin,
             mavlink.MAVLINK_MSG_ID_SYS_STATUS: self._sys_status,
@@ -172,30 +157,18 @@ class Autopilot:
             for frame in frames(datagram.data):
                 self._frame(frame, datagram.t_us)
         self._ask_the_time(now_us)
-        if self._sample is None or self.mode is FlightMode.UNKNOWN:
+        if self.states.newest is None or self.mode is FlightMode.UNKNOWN:
             return None
         if self.watch.in_doubt:
             self.invalid["mode not told since a silence"] += 1
             if self.watch.asks(now_us):
                 self._ask_for(mavlink.MAVLINK_MSG_ID_HEARTBEAT)
             return None
-        return self._state(self._sample, now_us)
+        return self._state(now_us)
 
     def send(self, setpoint: AttitudeSetpoint, now_us: int) -> str:
-        """Send one setpoint and return the reason of a refusal, or "".
-
-        No other code in the project sends setpoints.
-        """
-        refused = setpoint.problem(now_us)
-        if refused:
-            self.refused_setpoints += 1
-            return refused
-        stamp_ms, q_nb = now_us // 1000 & 0xFFFFFFFF, setpoint.q_nb.tolist()
-        whom_and_what = self._sysid, 1, _ATTITUDE_ONLY
-        payload = _SETPOINT.pack(stamp_ms, *q_nb, 0.0, 0.0, 0.0, setpoint.thrust_01, *whom_and_what)
-        self._measure_gap(now_us)
-        self.send_frame(self._codec.frame(mavlink.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET, payload))
-        return ""
+        """Send one setpoint and return the reason of a refusal, or ""."""
+        return self.setpoints.send(setpoint, now_us, self.setpoint_loss_s, self.watch.departures)
 
     @property
     def setpoint_loss_s(self) -> float | None:
@@ -204,17 +177,6 @@ class Autopilot:
 
     def close(self) -> None:
         self._transport.close()
-
-    def _measure_gap(self, now_us: int) -> None:
-        """Count a pause of the setpoints that was longer than the autopilot waits for them.
-
-        PX4 returns to OFFBOARD by itself when setpoints resume, perhaps before CURRENT_MODE reports the departure.
-        """
-        last_us, stayed = self._setpoint_us, self._departures == self.watch.departures
-        self._setpoint_us, self._departures = now_us, self.watch.departures
-        loss_s = self.setpoint_loss_s
-        if last_us is not None and stayed and loss_s is not None and now_us - last_us > loss_s * 1e6:
-            self.gaps, self.gap_s = self.gaps + 1, (now_us - last_us) * 1e-6
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
@@ -271,92 +233,26 @@ class Autopilot:
         """Return the oldest message of the autopilot that was not returned yet; of many, the newest are kept."""
         return self._texts.popleft() if self._texts else None
 
-    # -- state --------------------------------------------------------------------------------------------------------
-
-    def _odometry(self, message: Any, arrived_us: int) -> None:
-        if message.frame_id != _LOCAL_NED or message.child_frame_id not in (_LOCAL_NED, *_BODY_FRD):
-            self._codec.refused["odometry frame"] += 1
-            return
-        self._odometry_us = arrived_us
-        q_nb = message.q_0, message.q_1, message.q_2, message.q_3
-        vel: Vector = message.vx, message.vy, message.vz
-        if message.child_frame_id in _BODY_FRD:
-            vel = numbers_rotated_to_ned(q_nb, vel)
-        rate = message.rollspeed, message.pitchspeed, message.yawspeed
-        pos = message.x, message.y, message.z
-        if self._take(message.time_usec, arrived_us, pos, vel, q_nb=q_nb, rate=rate):
-            self._was_reset |= self._reset_counter not in (None, message.reset_counter)
-            self._reset_counter = message.reset_counter
-
-    def _attitude_quaternion(self, message: Any, arrived_us: int) -> None:
-        q_nb = message.q1, message.q2, message.q3, message.q4
-        self._attitude = q_nb, (message.rollspeed, message.pitchspeed, message.yawspeed)
-
-    def _local_position(self, message: Any, arrived_us: int) -> None:
-        """Combine a local position with the newest attitude, for autopilots without ODOMETRY."""
-        if self._attitude is None or (arrived_us - self._odometry_us < 500_000 and self._odometry_us):
-            return
-        pos, vel = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
-        q_nb, rate = self._attitude
-        self._take(message.time_boot_ms * 1000, arrived_us, pos, vel, q_nb=q_nb, rate=rate)
-
-    def _take(
-        self, vehicle_us: int, arrived_us: int, pos: Vector, vel: Vector, *, q_nb: Quaternion, rate: Vector
-    ) -> bool:
-        """Keep a sample if it is valid and the newest; return whether it was kept."""
-        w, x, y, z = q_nb
-        norm = math.sqrt((w * w + y * y) + (x * x + z * z))  # in the order of a dot product, by which it rounds
-        if problem := state_problem(pos, vel, rate, norm):
-            self._codec.refused[problem] += 1
-            return False
-        t_us = self.clock.to_local(vehicle_us, arrived_us)
-        if t_us is None:
-            self._codec.refused["stamp not believed"] += 1
-            return False
-        if self.clock.restarts != self._restarts:
-            self._restarts, self._sample = self.clock.restarts, None
-        if self.clock.boots != self._boots:
-            self._boots = self.clock.boots
-            self._forget()
-            self._odometry_us = arrived_us
-        self.samples += 1
-        if self._sample is not None and vehicle_us < self._sample.vehicle_us:
-            return False
-        self._sample = Sample(vehicle_us, t_us, pos, vel, (w / norm, x / norm, y / norm, z / norm), rate)
-        return True
-
-    def _state(self, sample: Sample, now_us: int) -> VehicleState | None:
-        if self._placed is None or self._placed.sample is not sample:
-            self._placed = self._place(sample)
-        if self._placed is None:
+    def _state(self, now_us: int) -> VehicleState | None:
+        placed = self.states.placed(self.armed)
+        if placed is None:
             return None
         mode, failsafe = self.watch.show(now_us)
         return VehicleState(
-            t_us=sample.t_us,
-            pos_ned_m=self._placed.pos_ned_m,
-            vel_ned_m_s=self._placed.vel_ned_m_s,
-            q_nb=self._placed.q_nb,
-            rate_frd_rad_s=self._placed.rate_frd_rad_s,
+            t_us=placed.sample.t_us,
+            pos_ned_m=placed.pos_ned_m,
+            vel_ned_m_s=placed.vel_ned_m_s,
+            q_nb=placed.q_nb,
+            rate_frd_rad_s=placed.rate_frd_rad_s,
             armed=self.armed,
             mode=mode,
             landed=self.landed,
             failsafe=failsafe,
         )
 
-    def _place(self, sample: Sample) -> Placed | None:
-        """Return the sample in the shared frame; None while its place can't be known."""
-        vel, was_reset = np.array(sample.vel_ned_m_s), self._was_reset
-        self._was_reset = False
-        pos = self.frame.place(sample.vehicle_us, np.array(sample.pos_ned_m), vel, self.armed, reset=was_reset)
-        if pos is None:
-            return None
-        return Placed(sample, pos, vel, np.array(sample.q_nb), np.array(sample.rate_frd_rad_s))
-
     def _forget(self) -> None:
         """Discard everything the vehicle has reported: it has rebooted, or was never received."""
-        self._sample = self._placed = self._attitude = self._reset_counter = None
-        self._was_reset = False
-        self._odometry_us = 0
+        self.states.forget()
         self.landed, self.armable, self.health = Landed.UNKNOWN, False, VehicleHealth()
         self.params, self.whole_params = {}, set()
         self.hover_thrust_01 = self.pos_accuracy_m = None
@@ -368,9 +264,10 @@ class Autopilot:
         self.frame.told(_geodetic(message.latitude, message.longitude, message.altitude))
 
     def _global_position(self, message: Any, arrived_us: int) -> None:
-        if self._sample is not None:
+        sample = self.states.newest
+        if sample is not None:
             place = _geodetic(message.lat, message.lon, message.alt)
-            local_us, _, pos, vel = self._sample[:4]
+            local_us, _, pos, vel = sample[:4]
             self.frame.seen(place, message.time_boot_ms * 1000, local_us, np.array(pos), vel_ned_m_s=np.array(vel))
 
     def _ask_the_time(self, now_us: int) -> None:
@@ -417,10 +314,11 @@ class Autopilot:
             self.hover_thrust_01 = message.thrust
 
     def _hovers_by_itself(self, now_us: int) -> bool:
-        if self.mode is not FlightMode.EXTERNAL or self._sample is None:
+        sample, setpoint_us = self.states.newest, self.setpoints.sent_us
+        if self.mode is not FlightMode.EXTERNAL or sample is None:
             return self.mode is FlightMode.HOLD
-        own = self._setpoint_us is None or now_us - self._setpoint_us > _OWN_FLIGHT_US
-        return own and abs(self._sample.vel_ned_m_s[2]) < _HOVER_M_S
+        own = setpoint_us is None or now_us - setpoint_us > _OWN_FLIGHT_US
+        return own and abs(sample.vel_ned_m_s[2]) < _HOVER_M_S
 
 
 def _geodetic(lat_e7: int, lon_e7: int, alt_mm: int) -> GeoOrigin:

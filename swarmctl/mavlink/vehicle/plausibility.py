@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from swarmctl.mavlink.sample import Vector
+from swarmctl.mavlink.vehicle.sample import Vector
 
 _FARTHEST_M, _FASTEST_M_S, _FASTEST_RAD_S = 1e5, 500.0, 200.0  # on each axis
 
