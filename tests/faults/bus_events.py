@@ -16,7 +16,7 @@ from swarmctl.bus.peers import PeerPaths, agent_name
 from swarmctl.bus.senders import SenderVerifier
 from swarmctl.bus.topics import PATH, Topic
 from swarmctl.core.types import Array, PredictedPath
-from tests.closed_loop.test_guaranteed import only_seen
+from tests.closed_loop.test_guaranteed_cut_off import only_seen
 from tests.faults.row import Off
 from tests.faults.simulated import VICTIM, Holds, Scene
 
