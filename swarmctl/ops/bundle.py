@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from swarmctl import __version__
 from swarmctl.bus.peers import agent_name
-from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.check.parameters import unchangeable
-from swarmctl.check.scanner import run_scans
+from swarmctl.check.scan.link_facts import VehicleFacts
+from swarmctl.check.scan.scanner import run_scans
 from swarmctl.config import Config, MavlinkParams, load_recorded
 from swarmctl.errors import StartError
 from swarmctl.files import replaced

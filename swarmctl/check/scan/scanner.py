@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.check.link_statistics import Answer, FrameStatistics
-from swarmctl.check.listener import NOWHERE, Address, Listener, ReceivedDatagram
-from swarmctl.check.parameter_reader import ParameterReader
+from swarmctl.check.scan.link_statistics import Answer, FrameStatistics
+from swarmctl.check.scan.listener import NOWHERE, Address, Listener, ReceivedDatagram
+from swarmctl.check.scan.parameter_reader import ParameterReader
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects.dialect import Dialect
 from swarmctl.mavlink.dialects.discovery import DIALECTS

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swarmctl.check.link_facts import RoundTrip, VehicleTime
+from swarmctl.check.scan.link_facts import RoundTrip, VehicleTime
 
 _REORDERED = 128  # a sequence number this far behind belongs to a late frame, not to a gap
 _CLOCK_ANSWERS, _CLOCK_SPAN_S = 8, 0.8  # fewer answers or a shorter span give no drift

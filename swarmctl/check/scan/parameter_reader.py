@@ -8,7 +8,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.check.link_facts import Parameter
+from swarmctl.check.scan.link_facts import Parameter
 from swarmctl.mavlink.dialects.dialect import Dialect
 
 _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32

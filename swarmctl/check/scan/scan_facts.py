@@ -7,7 +7,7 @@ from typing import Any
 
 import pymap3d
 
-from swarmctl.check.link_facts import (
+from swarmctl.check.scan.link_facts import (
     Estimator,
     Gps,
     LinkFacts,
@@ -16,8 +16,8 @@ from swarmctl.check.link_facts import (
     VehicleFacts,
     Version,
 )
-from swarmctl.check.link_statistics import FrameStatistics, round_trip, vehicle_time
-from swarmctl.check.scanner import ARMED_FLAG, VehicleScan
+from swarmctl.check.scan.link_statistics import FrameStatistics, round_trip, vehicle_time
+from swarmctl.check.scan.scanner import ARMED_FLAG, VehicleScan
 from swarmctl.core.types import FlightMode, GeoOrigin, Landed
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.signing.refusals import in_words

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from swarmctl.check.listener import Address, Listener, ReceivedDatagram
+from swarmctl.check.scan.listener import Address, Listener, ReceivedDatagram
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.signing.channel import SigningChannel
 from swarmctl.mavlink.signing.recognition import SignedRecognition
