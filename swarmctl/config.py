@@ -7,37 +7,59 @@ sections checked (`config_constraints`), and writes the resolved copy. It opens 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
+import numpy as np
 import tomli_w
 from pydantic import Field
 
 from swarmctl.agent.setup import AgentParams
-from swarmctl.bus.network.hosts import HostParams, roster_of
+from swarmctl.bus.json_messages import MAX_OBSTACLES
+from swarmctl.bus.network.hosts import HostParams, host_problems, roster_of
 from swarmctl.bus.network.roster import OwnIdentity
-from swarmctl.config_constraints import constraint_problems, reference_problems
+from swarmctl.config_constraints import (
+    forward_problems,
+    own_controller_problems,
+    separation_problems,
+    simulated_host_problems,
+    starts_apart,
+    vehicle_problems,
+    volume_problems,
+)
 from swarmctl.config_problems import validated
+from swarmctl.config_sections import (
+    BusParams,
+    LimitParams,
+    MavlinkParams,
+    SitlParams,
+    StartParams,
+    SwarmParams,
+    TelemetryParams,
+    VehicleParams,
+)
 from swarmctl.config_shows import read_show
 from swarmctl.config_source import override, read_tree, set_value
 from swarmctl.config_tables import read_tables
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.reference.feasibility import FlightLimits, infeasible
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.params import Params, Vec3
+from swarmctl.core.own import OwnError
+from swarmctl.core.params import Params
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.geofence import GeofenceParams
+from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.own_modules import locate, make_importable, own_problems
-from swarmctl.signing_keys import locate_identities, locate_keys
-from swarmctl.simulator_config import EVERY_VEHICLE, MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
+from swarmctl.signing_keys import key_problems, locate_identities, locate_keys
+from swarmctl.simulator_config import EVERY_VEHICLE, OriginParams, SimulatorConfig, SimulatorParams
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 
-MAX_AGENTS = MAX_VEHICLES
 NO_VALUES: Mapping[str, Any] = MappingProxyType({})
 _RENAMED = {  # keys of versions before 0.2
     "agent.commit.bias_rad": "agent.commit.right_of_way_rad",
@@ -49,74 +71,6 @@ _RENAMED = {  # keys of versions before 0.2
     "separation.bias_obstacle_rad": "separation.right_of_way_obstacle_rad",
     "separation.bias_rad": "separation.right_of_way_rad",
 }
-
-
-class SwarmParams(OriginParams):
-    """Size of the swarm and origin of its frame."""
-
-    agents: int = Field(3, ge=1, le=MAX_AGENTS)  # overridden by --agents
-
-
-class StartParams(Params):
-    """Positions at which agents wait for the mission to begin: a line, or `positions_ned_m` if given."""
-
-    positions_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one for each agent
-    center_ned_m: Vec3 = (0.0, 0.0, 0.0)  # centre of the line
-    direction_ned: Vec3 = (1.0, 0.0, 0.0)  # direction of the line, of any length
-    spacing_m: float = Field(1.0, gt=0, le=100)  # distance of neighbours on the line
-
-
-class VehicleParams(Params):
-    """Address of one autopilot and, optionally, a model of its vehicle."""
-
-    sysid: int = Field(ge=1, le=255)  # MAVLink system id, different for each vehicle
-    url: str  # udpin://, udpout://, tcp:// or serial://
-    model: VehicleModelParams | None = None  # replaces the whole section vehicle_model for this vehicle
-
-
-class MavlinkParams(Params):
-    """Parameters of the MAVLink links to the vehicles."""
-
-    signing_keys: tuple[str, ...] = Field((), strict=False)  # key file of each vehicle in turn; none: nothing is signed
-    forward: Annotated[tuple[str, ...], Field(strict=False, max_length=4)] = ()  # udpout:// of ground stations
-    forward_commands: bool = False  # whether these may command the vehicles; otherwise they may read only
-
-
-class SitlParams(SimulatorParams):
-    """The built-in simulator that launch starts; disabled to fly other vehicles."""
-
-    enabled: bool = True
-    ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
-    link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only
-
-
-class BusParams(Params):
-    """Parameters of the Zenoh bus, and the seeded faults of the lockstep bus."""
-
-    identities: str = ""  # folder written by swarmctl keys init; needed by swarmctl host and station only
-    relay: bool = False  # hosts pass on what others say; else each is heard on its own links alone
-    lease_ms: int = Field(1500, ge=500, le=10000)  # silence after which Zenoh closes a link
-    delay_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, on top of one tick
-    loss_01: float = Field(0.0, ge=0, le=1)  # lockstep only
-    burst_01: float = Field(0.0, ge=0, le=0.99)  # lockstep only, fraction of time in which a link loses everything
-    burst_s: float = Field(2.0, ge=0.01, le=600)  # lockstep only, mean length of such a bad period
-    jitter_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, largest extra delay; messages overtake each other
-
-
-class TelemetryParams(Params):
-    """Parameters of the viewer, the one process that uses rerun."""
-
-    enabled: bool = True
-    port: int = Field(9877, ge=1, le=65535)  # loopback, not the default of rerun; the next free one if taken
-    rate_hz: float = Field(10.0, gt=0, le=50)  # updates of the view per agent
-
-
-class LimitParams(Params):
-    """Limits beyond which the referee counts a violation."""
-
-    min_separation_m: float = Field(0.85, ge=0, le=100)  # distance of two centres, of true states where there are any
-    obstacle_margin_m: float = Field(0.05, ge=0, le=10)  # allowed intrusion into keep_out_m
-    deadline_misses_01: float = Field(0.2, ge=0, le=1)  # largest fraction of deadlines missed
 
 
 class Config(Params):
@@ -244,7 +198,7 @@ def load(
     config = validated(Config, tree, source, _RENAMED)
     make_importable(config.own_folder)
     problems = list(own_problems(config.mission, config.controller, config.vehicle_model, config.separation))
-    problems = problems or list(constraint_problems(config, only_agents)) or list(reference_problems(config))
+    problems = problems or list(_whole(config, only_agents)) or list(_infeasible(config))
     if problems:
         raise ConfigError(source, problems)
     return config
@@ -267,7 +221,7 @@ def load_mission(config: Config, path: Path) -> MissionParams:
     if changed.mission.is_own:
         own = "is somebody else's code, which is flown only by a launch that was started with it"
         raise ConfigError(source, [f"mission.kind = {changed.mission.kind!r}: {own}"])
-    if problems := list(changed.mission.problems(config.swarm.agents)) or list(reference_problems(changed)):
+    if problems := list(changed.mission.problems(config.swarm.agents)) or list(_infeasible(changed)):
         raise ConfigError(source, problems)
     return changed.mission
 
@@ -298,3 +252,63 @@ def own_identity(config: Config, name: str) -> OwnIdentity:
 def dump(config: Config) -> str:
     """Return the resolved configuration as TOML, which `load` reads back to the same tree."""
     return tomli_w.dumps(config.model_dump(exclude_none=True))
+
+
+def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]:
+    """Yield problems between keys and sections, and of files."""
+    agents, separation = config.swarm.agents, config.separation
+    yield from _start_problems(config)
+    yield from vehicle_problems(config.vehicles, agents, simulated=config.sitl.enabled)
+    yield from host_problems(config.hosts, agents)
+    yield from simulated_host_problems(config.hosts if config.sitl.enabled else ())
+    yield from forward_problems(config.mavlink.forward)
+    yield from key_problems(config.mavlink.signing_keys, agents, only_agents)
+    if len(config.obstacles) > MAX_OBSTACLES:
+        yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
+    yield from parameter_problems(config.agent.autopilot_params)
+    yield from config.agent.failsafe.problems()
+    if config.sitl.speed != 1.0:
+        yield (
+            f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
+            "real time: swarmctl simulate, or python -m sitl --speed with clients of your own"
+        )
+    yield from config.mission.problems(agents)
+    yield from own_controller_problems(config.controller, separation, config.agent.barrier)
+    drift_m = config.drift_m if agents > 1 else 0.0
+    yield from separation_problems(separation, config.vehicle_model, config.limits, agents, drift_m)
+
+
+def _start_problems(config: Config) -> Iterator[str]:
+    agents, listed = config.swarm.agents, len(config.start.positions_ned_m)
+    if listed and listed < agents:
+        yield f"start.positions_ned_m: {listed} positions for swarm.agents = {agents}; list one for each agent"
+    if not listed and not any(config.start.direction_ned):
+        yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
+    elif not (listed and listed < agents):
+        yield from starts_apart(config.starts_ned_m(), config.separation, config.sitl)
+        yield from config.geofence.problems(config.starts_ned_m())
+        yield from volume_problems(
+            config.volume, config.geofence, config.controller, config.separation, config.starts_ned_m(), config.drift_m
+        )
+        try:
+            config.simulator()
+        except ConfigError as error:
+            yield from (f"sitl.{problem}" for problem in error.problems)
+
+
+def _infeasible(config: Config) -> Iterator[str]:
+    """Yield why the references of a configuration without other problems can't be flown."""
+    separation = config.separation
+    limits = FlightLimits(
+        duration_s=config.mission.duration_s,
+        apart_m=separation.radius_m,
+        downwash=separation.downwash,
+        ground_z_m=config.sitl.ground_z_m if config.sitl.enabled else None,
+        volume=config.volume.flight_volume(),
+    )
+    try:
+        references = config.mission.references(np.array(config.starts_ned_m()), separation.budget.planned_m)
+    except OwnError as error:
+        yield f"mission.kind = {config.mission.kind!r}: {error}"
+        return
+    yield from infeasible(references, [config.model_of(i) for i in range(len(references))], limits)
