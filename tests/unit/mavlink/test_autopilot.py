@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.types import AttitudeSetpoint, FlightMode, Landed
+from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.transport import PipeTransport
 from tests.benches.autopilot_link import LEVEL, PX4_HOLD, PX4_LAND, PX4_OFFBOARD, SHARED, Bench, odometry
 
