@@ -76,29 +76,13 @@ class SitlWorld:
         if len(transports) != params.vehicles or len(gcs_transports) not in (0, params.vehicles):
             raise ValueError(f"transports: {len(transports)} and {len(gcs_transports)} for {params.vehicles} vehicles")
         self.params = params
-        count, dt_s = params.vehicles, 1.0 / params.physics_hz
-        preset = outfitted(PRESETS[params.preset], params)
+        count = params.vehicles
         shared = GeoOrigin(params.origin_lat_deg, params.origin_lon_deg, params.origin_alt_m)
         spawns_ned_m = np.array(params.spawns_ned_m())  # (N, 3)
         self.origins = [local_origin(spawn, shared) for spawn in spawns_ned_m]
         self._offset_ned_m = np.array([origin.offset_ned_m for origin in self.origins])  # (N, 3)
-        airborne = params.start == "air"
-        self.plant = Plant(
-            preset,
-            spawns_ned_m - self._offset_ned_m,  # local: the spawn itself is exact, its origin is rounded
-            dt_s,
-            ground=not airborne,
-            mass_scale=params.mass_scale,
-            thrust_curve_01=params.thrust_curve_01,
-            ground_effect=params.ground_effect,
-        )
-        self.plant.held[:] = airborne
-        self.estimator = Estimator(ESTIMATORS[params.estimator], self.plant, params.seed)
-        self.attitude = attitude_loop(preset, count, dt_s, params.attitude_gains)
         self._autopilot_every = max(1, round(params.physics_hz / AUTOPILOT_HZ))
-        self.physics = Physics(
-            self.plant, self.attitude, self.estimator, params, seed=params.seed, slow_every=self._autopilot_every
-        )
+        self._make_plant(spawns_ned_m - self._offset_ned_m)  # local: the spawn is exact, its origin is rounded
         self.autopilots: list[Commander] = []
         self.endpoints: list[MavlinkInterface] = []
         self._links = [LossyLink(link, (params.seed, i, _LINK_PURPOSE)) for i, link in enumerate(transports)]
@@ -108,7 +92,6 @@ class SitlWorld:
         ]
         self.signing: list[VehicleSigning] = []
         self._keys = keys
-        self.imu = Imu(self.plant, self._autopilot_every * dt_s)
         build = self._arducopter if params.autopilot_kind == "arducopter" else self._px4
         for i in range(count):
             pilot, endpoint = build(i)
@@ -118,7 +101,7 @@ class SitlWorld:
         self._wrench = np.zeros((4, count))
         self._powered = np.zeros(count, dtype=bool)
         self._kept = np.zeros(count, dtype=bool)  # on the ground or clamped
-        self._clamped = set(range(count)) if airborne else set()
+        self._clamped = set(range(count)) if params.start == "air" else set()
         self._flown = [IDLE] * count
         self._boot_us: int | None = None
         self._now_us = 0
@@ -127,6 +110,27 @@ class SitlWorld:
         if problems:
             raise ConfigError("sitl", problems)
         self.faults = Faults(self, params.faults, count, params.first_vehicle)
+
+    def _make_plant(self, spawns_local_ned_m: Array) -> None:
+        """Make the vehicles at their spawns (N, 3), and what measures them and keeps their attitude."""
+        params, dt_s, airborne = self.params, 1.0 / self.params.physics_hz, self.params.start == "air"
+        preset = outfitted(PRESETS[params.preset], params)
+        self.plant = Plant(
+            preset,
+            spawns_local_ned_m,
+            dt_s,
+            ground=not airborne,
+            mass_scale=params.mass_scale,
+            thrust_curve_01=params.thrust_curve_01,
+            ground_effect=params.ground_effect,
+        )
+        self.plant.held[:] = airborne
+        self.estimator = Estimator(ESTIMATORS[params.estimator], self.plant, params.seed)
+        self.attitude = attitude_loop(preset, params.vehicles, dt_s, params.attitude_gains)
+        self.physics = Physics(
+            self.plant, self.attitude, self.estimator, params, seed=params.seed, slow_every=self._autopilot_every
+        )
+        self.imu = Imu(self.plant, self._autopilot_every * dt_s)
 
     def step(self, now_us: int) -> None:
         """Do one physics step that ends at `now_us` (monotonic); then send everything due, stamped with it."""

@@ -1,17 +1,16 @@
 """Configuration of a whole run: one frozen tree, read from TOML. An invalid one is refused with all its problems.
 
-Parameter classes live beside the code that uses them. This module composes them, checks constraints between sections,
-and writes the resolved copy. It opens no sockets and starts nothing.
+Parameter classes live beside the code that uses them. This module composes them, has constraints between
+sections checked (`config_constraints`), and writes the resolved copy. It opens no sockets and starts nothing.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import tomli_w
@@ -21,11 +20,30 @@ from swarmctl.agent.setup import AgentParams
 from swarmctl.bus.json_messages import MAX_OBSTACLES
 from swarmctl.bus.network.hosts import HostParams, host_problems, roster_of
 from swarmctl.bus.network.roster import OwnIdentity
+from swarmctl.config_constraints import (
+    forward_problems,
+    own_controller_problems,
+    separation_problems,
+    simulated_host_problems,
+    starts_apart,
+    vehicle_problems,
+    volume_problems,
+)
 from swarmctl.config_problems import validated
+from swarmctl.config_sections import (
+    BusParams,
+    LimitParams,
+    MavlinkParams,
+    SitlParams,
+    StartParams,
+    SwarmParams,
+    TelemetryParams,
+    VehicleParams,
+)
 from swarmctl.config_shows import read_show
 from swarmctl.config_source import override, read_tree, set_value
 from swarmctl.config_tables import read_tables
-from swarmctl.control.collision.separation import SeparationParams, radius_problem
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.feasibility import FlightLimits, infeasible
@@ -33,19 +51,16 @@ from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.own import OwnError
-from swarmctl.core.params import Params, Vec3
+from swarmctl.core.params import Params
 from swarmctl.errors import ConfigError
-from swarmctl.mavlink.geofence import GeofenceParams, is_inside
+from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.parameter_names import parameter_problems
-from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.own_modules import locate, make_importable, own_problems
 from swarmctl.signing_keys import key_problems, locate_identities, locate_keys
-from swarmctl.simulator_config import EVERY_VEHICLE, MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
+from swarmctl.simulator_config import EVERY_VEHICLE, OriginParams, SimulatorConfig, SimulatorParams
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 
-MAX_AGENTS = MAX_VEHICLES
 NO_VALUES: Mapping[str, Any] = MappingProxyType({})
-_PAIRS_SHOWN = 3
 _RENAMED = {  # keys of versions before 0.2
     "agent.commit.bias_rad": "agent.commit.right_of_way_rad",
     "agent.commit.share_01": "agent.commit.tilt_fraction_01",
@@ -56,74 +71,6 @@ _RENAMED = {  # keys of versions before 0.2
     "separation.bias_obstacle_rad": "separation.right_of_way_obstacle_rad",
     "separation.bias_rad": "separation.right_of_way_rad",
 }
-
-
-class SwarmParams(OriginParams):
-    """Size of the swarm and origin of its frame."""
-
-    agents: int = Field(3, ge=1, le=MAX_AGENTS)  # overridden by --agents
-
-
-class StartParams(Params):
-    """Positions at which agents wait for the mission to begin: a line, or `positions_ned_m` if given."""
-
-    positions_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one for each agent
-    center_ned_m: Vec3 = (0.0, 0.0, 0.0)  # centre of the line
-    direction_ned: Vec3 = (1.0, 0.0, 0.0)  # direction of the line, of any length
-    spacing_m: float = Field(1.0, gt=0, le=100)  # distance of neighbours on the line
-
-
-class VehicleParams(Params):
-    """Address of one autopilot and, optionally, a model of its vehicle."""
-
-    sysid: int = Field(ge=1, le=255)  # MAVLink system id, different for each vehicle
-    url: str  # udpin://, udpout://, tcp:// or serial://
-    model: VehicleModelParams | None = None  # replaces the whole section vehicle_model for this vehicle
-
-
-class MavlinkParams(Params):
-    """Parameters of the MAVLink links to the vehicles."""
-
-    signing_keys: tuple[str, ...] = Field((), strict=False)  # key file of each vehicle in turn; none: nothing is signed
-    forward: Annotated[tuple[str, ...], Field(strict=False, max_length=4)] = ()  # udpout:// of ground stations
-    forward_commands: bool = False  # whether these may command the vehicles; otherwise they may read only
-
-
-class SitlParams(SimulatorParams):
-    """The built-in simulator that launch starts; disabled to fly other vehicles."""
-
-    enabled: bool = True
-    ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
-    link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only
-
-
-class BusParams(Params):
-    """Parameters of the Zenoh bus, and the seeded faults of the lockstep bus."""
-
-    identities: str = ""  # folder written by swarmctl keys init; needed by swarmctl host and station only
-    relay: bool = False  # hosts pass on what others say; else each is heard on its own links alone
-    lease_ms: int = Field(1500, ge=500, le=10000)  # silence after which Zenoh closes a link
-    delay_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, on top of one tick
-    loss_01: float = Field(0.0, ge=0, le=1)  # lockstep only
-    burst_01: float = Field(0.0, ge=0, le=0.99)  # lockstep only, fraction of time in which a link loses everything
-    burst_s: float = Field(2.0, ge=0.01, le=600)  # lockstep only, mean length of such a bad period
-    jitter_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, largest extra delay; messages overtake each other
-
-
-class TelemetryParams(Params):
-    """Parameters of the viewer, the one process that uses rerun."""
-
-    enabled: bool = True
-    port: int = Field(9877, ge=1, le=65535)  # loopback, not the default of rerun; the next free one if taken
-    rate_hz: float = Field(10.0, gt=0, le=50)  # updates of the view per agent
-
-
-class LimitParams(Params):
-    """Limits beyond which the referee counts a violation."""
-
-    min_separation_m: float = Field(0.85, ge=0, le=100)  # distance of two centres, of true states where there are any
-    obstacle_margin_m: float = Field(0.05, ge=0, le=10)  # allowed intrusion into keep_out_m
-    deadline_misses_01: float = Field(0.2, ge=0, le=1)  # largest fraction of deadlines missed
 
 
 class Config(Params):
@@ -309,24 +256,12 @@ def dump(config: Config) -> str:
 
 def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]:
     """Yield problems between keys and sections, and of files."""
-    agents = config.swarm.agents
-    listed = len(config.start.positions_ned_m)
-    if listed and listed < agents:
-        yield f"start.positions_ned_m: {listed} positions for swarm.agents = {agents}; list one for each agent"
-    if not listed and not any(config.start.direction_ned):
-        yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
-    elif not (listed and listed < agents):
-        yield from _starts_apart(config)
-        yield from config.geofence.problems(config.starts_ned_m())
-        yield from _volume_problems(config)
-        try:
-            config.simulator()
-        except ConfigError as error:
-            yield from (f"sitl.{problem}" for problem in error.problems)
-    yield from _vehicle_problems(config)
+    agents, separation = config.swarm.agents, config.separation
+    yield from _start_problems(config)
+    yield from vehicle_problems(config.vehicles, agents, simulated=config.sitl.enabled)
     yield from host_problems(config.hosts, agents)
-    yield from _simulated_host_problems(config)
-    yield from _forward_problems(config)
+    yield from simulated_host_problems(config.hosts if config.sitl.enabled else ())
+    yield from forward_problems(config.mavlink.forward)
     yield from key_problems(config.mavlink.signing_keys, agents, only_agents)
     if len(config.obstacles) > MAX_OBSTACLES:
         yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
@@ -338,39 +273,27 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
             "real time: swarmctl simulate, or python -m sitl --speed with clients of your own"
         )
     yield from config.mission.problems(agents)
-    if config.controller.is_own and not config.agent.barrier.enabled:
-        yield "agent.barrier.enabled = false: an own controller flies behind the safety filter only; set it to true"
-    if config.controller.is_own and config.separation.mode == "guaranteed":
-        yield (
-            f"controller.kind = {config.controller.kind!r} with separation.mode = 'guaranteed': commitments are tracked"
-            " by built-in controllers; set separation.mode = 'best_effort'"
-        )
-    if agents > 1 and (problem := radius_problem(config.separation, 0.0, config.drift_m)):
-        yield problem
-    if config.separation.gust_m_s and not config.vehicle_model.drag_1_s:
-        yield (
-            f"separation.gust_m_s = {config.separation.gust_m_s:g}: what a gust does to a vehicle follows from its "
-            "drag; set vehicle_model.drag_1_s (swarmctl check --identify measures it)"
-        )
-    if config.separation.radius_m < config.limits.min_separation_m:
-        yield (
-            f"limits.min_separation_m = {config.limits.min_separation_m}: larger than separation.radius_m = "
-            f"{config.separation.radius_m}; agents would be judged by more than they keep. Lower it or raise the radius"
-        )
+    yield from own_controller_problems(config.controller, separation, config.agent.barrier)
+    drift_m = config.drift_m if agents > 1 else 0.0
+    yield from separation_problems(separation, config.vehicle_model, config.limits, agents, drift_m)
 
 
-def _volume_problems(config: Config) -> Iterator[str]:
-    """Yield what does not go with the flight volume."""
-    corners, fence = config.volume.corners_ne_m, config.geofence.corners_ne_m
-    yield from config.volume.problems(config.starts_ned_m(), config.separation.tracking_m + config.drift_m)
-    if corners and not (config.controller.keeps_volume or config.separation.mode == "guaranteed"):
-        yield (
-            f"controller.kind = {config.controller.kind!r} with a volume: it does not plan, and would fly out of it; "
-            "use dmpc, dmpc3 or mpc"
+def _start_problems(config: Config) -> Iterator[str]:
+    agents, listed = config.swarm.agents, len(config.start.positions_ned_m)
+    if listed and listed < agents:
+        yield f"start.positions_ned_m: {listed} positions for swarm.agents = {agents}; list one for each agent"
+    if not listed and not any(config.start.direction_ned):
+        yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
+    elif not (listed and listed < agents):
+        yield from starts_apart(config.starts_ned_m(), config.separation, config.sitl)
+        yield from config.geofence.problems(config.starts_ned_m())
+        yield from volume_problems(
+            config.volume, config.geofence, config.controller, config.separation, config.starts_ned_m(), config.drift_m
         )
-    beyond = [list(corner) for corner in corners if fence and not is_inside(corner, fence)]
-    if beyond:
-        yield f"volume.corners_ne_m: {beyond} are outside of geofence.corners_ne_m; move the corners or the fence"
+        try:
+            config.simulator()
+        except ConfigError as error:
+            yield from (f"sitl.{problem}" for problem in error.problems)
 
 
 def _infeasible(config: Config) -> Iterator[str]:
@@ -389,88 +312,3 @@ def _infeasible(config: Config) -> Iterator[str]:
         yield f"mission.kind = {config.mission.kind!r}: {error}"
         return
     yield from infeasible(references, [config.model_of(i) for i in range(len(references))], limits)
-
-
-def _starts_apart(config: Config) -> Iterator[str]:
-    starts = config.starts_ned_m()
-    pairs = ((math.dist(a, b), i, j) for (i, a), (j, b) in itertools.combinations(enumerate(starts), 2))
-    close = sorted(pair for pair in pairs if pair[0] < config.separation.radius_m)
-    for distance_m, i, j in close[:_PAIRS_SHOWN]:
-        yield (
-            f"start: agents {i} and {j} would wait {distance_m:.2f} m apart; separation.radius_m is "
-            f"{config.separation.radius_m}. Raise start.spacing_m or move them"
-        )
-    if len(close) > _PAIRS_SHOWN:
-        yield f"start: {len(close) - _PAIRS_SHOWN} more pairs of agents would wait too close together"
-    if config.sitl.enabled and config.sitl.start == "ground":
-        for i, start in enumerate(starts):
-            if start[2] > config.sitl.ground_z_m - 0.5:
-                yield (
-                    f"start: agent {i} waits at z = {start[2]} m, less than 0.5 m above the ground at "
-                    f"sitl.ground_z_m = {config.sitl.ground_z_m} (NED, down is positive)"
-                )
-
-
-def _vehicle_problems(config: Config) -> Iterator[str]:
-    agents = config.swarm.agents
-    if not config.vehicles:
-        if not config.sitl.enabled:
-            yield "vehicles: empty while sitl.enabled = false; list one [[vehicles]] with sysid and url for each agent"
-        return
-    if config.sitl.enabled:
-        yield (
-            "vehicles: listed while sitl.enabled = true; set sitl.enabled = false to fly them, "
-            "or remove them to fly the built-in simulator"
-        )
-    if len(config.vehicles) < agents:
-        yield f"vehicles: {len(config.vehicles)} listed for swarm.agents = {agents}; list one for each agent"
-    seen_sysids: dict[int, int] = {}
-    links: list[Endpoint | None] = []
-    for i, vehicle in enumerate(config.vehicles):
-        try:
-            link = parse_url(vehicle.url)
-        except ValueError as error:
-            yield f"vehicles.{i}.url = {error}"
-            link = None
-        rivals = [k for k, other in enumerate(links) if link and other and _same_place(link, other)]
-        links.append(link)
-        if rivals:
-            yield (
-                f"vehicles.{i}.url = {vehicle.url!r}: same port as vehicles.{rivals[0]}; "
-                "every vehicle needs a link of its own"
-            )
-        if vehicle.sysid in seen_sysids:
-            yield (
-                f"vehicles.{i}.sysid = {vehicle.sysid}: same as vehicles.{seen_sysids[vehicle.sysid]}; "
-                "give every autopilot its own MAV_SYS_ID"
-            )
-        seen_sysids.setdefault(vehicle.sysid, i)
-
-
-def _forward_problems(config: Config) -> Iterator[str]:
-    for i, url in enumerate(config.mavlink.forward):
-        try:
-            if parse_url(url).scheme != "udpout":
-                raise ValueError(f"{url!r}: only udpout://HOST:PORT is forwarded to")
-        except ValueError as error:
-            yield f"mavlink.forward.{i} = {error}"
-
-
-def _simulated_host_problems(config: Config) -> Iterator[str]:
-    for i, host in enumerate(config.hosts if config.sitl.enabled else ()):
-        if list(host.agents) != list(range(host.agents[0], host.agents[0] + len(host.agents))):
-            yield (
-                f"hosts.{i}.agents = {list(host.agents)}: a host simulates vehicles that follow one another; "
-                "list numbers without gaps"
-            )
-
-
-def _same_place(a: Endpoint, b: Endpoint) -> bool:
-    """Return whether two links share a serial device, a local port or a remote address."""
-    if a.scheme != b.scheme:
-        return False
-    if a.scheme == "serial":
-        return a.where == b.where
-    if a.scheme == "udpin" and "0.0.0.0" in (a.where, b.where):
-        return a.number == b.number
-    return (a.where, a.number) == (b.where, b.number)

@@ -19,6 +19,7 @@ import swarmctl  # noqa: F401  (before anything loads numpy)
 TESTS = Path(__file__).parent
 LONGEST = [  # half a minute and more each
     "process/test_launch.py",
+    "closed_loop/test_guaranteed_cut_off.py",
     "closed_loop/test_guaranteed.py",
     "process/test_readme.py",
     "closed_loop/test_failures.py",

@@ -7,19 +7,20 @@ from collections.abc import Callable
 import numpy as np
 
 from swarmctl.agent.agent import Agent
+from swarmctl.agent.ports import Ports, TickSink
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.agent.telemetry_publisher import TickSink
 from swarmctl.bus.peers import Bus
 from swarmctl.bus.topics import OPERATOR
+from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock
 from swarmctl.core.types import GeoOrigin
-from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import AUTOPILOT_COMPID, Codec
 from swarmctl.mavlink.commands import OWN_COMPID, CommandPort
 from swarmctl.mavlink.signing.channel import SigningChannel
 from swarmctl.mavlink.signing.signed_transport import SignedTransport
 from swarmctl.mavlink.transport import Transport
+from swarmctl.mavlink.vehicle.autopilot import Autopilot
 
 
 def make_agent(
@@ -41,13 +42,32 @@ def make_agent(
         config: configuration of the run.
         agent: index of this agent, from 0.
         boot_id: differs between restarts of the same agent.
-        transport, bus, clock, sink: see `Agent`.
+        transport, bus, clock, sink: see `Ports`.
         on_frame: called with every MAVLink frame sent or received.
         stopwatch_ns: measures the tick [ns].
         signing: signs and verifies the frames of the link; None: they are plain.
     """
-    sysid = config.sysids()[agent]
-    swarm = config.swarm
+    autopilot, commands = _connect_vehicle(config, agent, transport, on_frame, signing)
+    ports = Ports(
+        autopilot=autopilot,
+        commands=commands,
+        bus=CountedBus(bus),
+        clock=clock,
+        sink=sink,
+        stopwatch_ns=stopwatch_ns,
+    )
+    return Agent(_setup_of(config, agent, boot_id), ports)
+
+
+def _connect_vehicle(
+    config: Config,
+    agent: int,
+    transport: Transport,
+    on_frame: Callable[[bytes], None],
+    signing: SigningChannel | None,
+) -> tuple[Autopilot, CommandPort]:
+    """Return the hot path and the slow path to one vehicle, which share its link."""
+    sysid, swarm = config.sysids()[agent], config.swarm
     codec = Codec(sysid, OWN_COMPID)
     origin = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
     link = transport if signing is None else SignedTransport(transport, signing, sysid, AUTOPILOT_COMPID)
@@ -55,10 +75,15 @@ def make_agent(
     autopilot = Autopilot(link, codec, sysid, origin, on_frame=on_frame, refusals=refusals)
     commands = CommandPort(autopilot.send_frame, codec, sysid, lambda: autopilot.dialect)
     autopilot.connect(commands)
-    setup = AgentSetup(
+    return autopilot, commands
+
+
+def _setup_of(config: Config, agent: int, boot_id: int) -> AgentSetup:
+    swarm = config.swarm
+    return AgentSetup(
         agent=agent,
         boot_id=boot_id,
-        sysid=sysid,
+        sysid=config.sysids()[agent],
         vouchers={OPERATOR: frozenset(range(swarm.agents)), **{h.name: frozenset(h.agents) for h in config.hosts}},
         params=config.agent,
         mission=config.mission,
@@ -71,4 +96,3 @@ def make_agent(
         fence_ne_m=config.geofence.corners_ne_m,
         drift_m=config.drift_m,
     )
-    return Agent(setup, autopilot, commands, bus, clock=clock, sink=sink, stopwatch_ns=stopwatch_ns)

@@ -5,36 +5,35 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
-from swarmctl.agent.coordination import Coordination
-from swarmctl.agent.safety_filter import SafetyFilter
-from swarmctl.agent.separation_policy import BestEffort, Guaranteed, SeparationPolicy
+from swarmctl.agent.flying.safety_filter import SafetyFilter
+from swarmctl.agent.planning.coordination import Coordination
+from swarmctl.agent.planning.reference_selector import ReferenceSelector
+from swarmctl.agent.planning.separation_policy import BestEffort, Guaranteed, SeparationPolicy
+from swarmctl.agent.ports import Ports
+from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.agent.world_model import WorldModel
-from swarmctl.bus.peers import Bus
+from swarmctl.agent.sharing.telemetry_publisher import TelemetryPublisher
 from swarmctl.control.commit.trajectory_planner import following
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.estimation.state_filter import StateFilter
+from swarmctl.control.phases.mission_state import MissionSetup, MissionState
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.mission import MissionReference
+from swarmctl.core.trajectory import grid
 from swarmctl.mavlink.geofence import is_inside
+from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
-Note = Callable[..., None]
 Stopwatch = Callable[[], int]  # returns a running time [ns]
 
 
-def _best_effort(
-    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, *, stopwatch_ns: Stopwatch
-) -> SeparationPolicy:
+def _best_effort(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> SeparationPolicy:
     return BestEffort(world_model)
 
 
-def _guaranteed(
-    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, *, stopwatch_ns: Stopwatch
-) -> SeparationPolicy:
+def _guaranteed(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> SeparationPolicy:
     coordination = Coordination(
         agent=setup.agent,
         boot_id=setup.boot_id,
@@ -46,31 +45,23 @@ def _guaranteed(
         volume=setup.volume,
         max_keep_outs=setup.max_keep_outs,
         world_model=world_model,
-        bus=bus,
-        note=note,
-        stopwatch_ns=stopwatch_ns,
+        bus=ports.bus,
+        note=ports.note,
+        stopwatch_ns=ports.stopwatch_ns,
         rate_hz=setup.params.rate_hz,
     )
-    return Guaranteed(coordination, setup.mission.yaw_rad, stopwatch_ns)
+    return Guaranteed(coordination, setup.mission.yaw_rad, ports.stopwatch_ns)
 
 
 def _following(setup: AgentSetup) -> ControllerParams:
     return setup.controller.model_copy(update={"mpc": following(setup.controller.mpc, setup.params.commit)})
 
 
-class MakesPolicy(Protocol):
-    """Makes the policy of a separation mode."""
-
-    def __call__(
-        self, setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, *, stopwatch_ns: Stopwatch
-    ) -> SeparationPolicy: ...
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeparationMode:
     """A row of the table of separation modes: the policy, and the controller that suits it."""
 
-    policy: MakesPolicy
+    policy: Callable[[AgentSetup, Ports, WorldModel], SeparationPolicy]
     controller: Callable[[AgentSetup], ControllerParams]
 
 
@@ -80,11 +71,33 @@ SEPARATION_MODES = {  # by `separation.mode`
 }
 
 
-def make_separation_policy(
-    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, *, stopwatch_ns: Stopwatch
-) -> SeparationPolicy:
+def make_separation_policy(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> SeparationPolicy:
     """Return the policy that keeps the agent apart from its peers."""
-    return SEPARATION_MODES[setup.separation.mode].policy(setup, world_model, bus, note, stopwatch_ns=stopwatch_ns)
+    return SEPARATION_MODES[setup.separation.mode].policy(setup, ports, world_model)
+
+
+def make_world_model(setup: AgentSetup, ports: Ports) -> WorldModel:
+    """Return what the agent knows of peers and obstacles: nothing yet."""
+    return WorldModel(
+        setup.agent,
+        setup.peers,
+        setup.separation,
+        ports.bus,
+        rate_hz=setup.params.rate_hz,
+        note=ports.note,
+        vouchers=setup.vouchers,
+    )
+
+
+def make_vehicle_setup(setup: AgentSetup, ports: Ports) -> VehicleSetup:
+    """Return what sets up the vehicle's link and the parameters that the flight needs."""
+    return VehicleSetup(
+        ports.autopilot,
+        ports.commands,
+        setup.params.autopilot_params,
+        setup.sysid,
+        state_rate_hz=setup.params.state_machine.state_rate_hz,
+    )
 
 
 def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Controller, Controller]:
@@ -113,18 +126,41 @@ def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:
     return DisturbanceObserver(params.disturbance, model.hover_thrust_01)
 
 
-def make_safety_filter(setup: AgentSetup, world_model: WorldModel, note: Note, stopwatch_ns: Stopwatch) -> SafetyFilter:
+def make_safety_filter(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> SafetyFilter:
     """Return the safety filter that keeps the vehicle clear of the bodies around it."""
-    dt_s = 1.0 / setup.params.rate_hz
-    downwash = setup.separation.downwash
     return SafetyFilter(
         setup.params.barrier,
         setup.vehicle_model,
-        dt_s,
+        1.0 / setup.params.rate_hz,
         world_model,
-        downwash=downwash,
-        note=note,
-        stopwatch_ns=stopwatch_ns,
+        downwash=setup.separation.downwash,
+        note=ports.note,
+        stopwatch_ns=ports.stopwatch_ns,
+    )
+
+
+def make_reference_selector(
+    setup: AgentSetup, ports: Ports, mission: MissionState, controller: Controller, delay_us: int
+) -> ReferenceSelector:
+    """Return what selects the reference of plans, which begin `delay_us` from now, where a setpoint acts."""
+    ahead_s = delay_us * 1e-6 + controller.dt_us * 1e-6 * grid(controller.longest)  # (longest+1,)
+    return ReferenceSelector(setup, mission, ahead_s, ports.note)
+
+
+def make_telemetry_publisher(
+    setup: AgentSetup, ports: Ports, world_model: WorldModel, separation: SeparationPolicy
+) -> TelemetryPublisher:
+    """Return what records and publishes the agent's ticks."""
+    return TelemetryPublisher(
+        setup.agent,
+        setup.boot_id,
+        setup.sysid,
+        separation.uses_commitments,
+        autopilot=ports.autopilot,
+        paths=world_model.paths,
+        bus=ports.bus,
+        clock=ports.clock,
+        sink=ports.sink,
     )
 
 
@@ -132,14 +168,14 @@ def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
     """Return the state machine of the agent's mission."""
     budget = setup.separation.budget
     reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, budget.planned_m)
-    return MissionStateMachine(
-        setup.params.state_machine,
-        setup.agent,
-        len(setup.peers),
-        budget.landing_m(setup.params.state_machine.apart_m),
+    mission = MissionSetup(
+        agent=setup.agent,
+        peers=len(setup.peers),
+        landing_m=budget.landing_m(setup.params.state_machine.apart_m),
         start_ned_m=setup.starts_ned_m[setup.agent],
         duration_s=setup.mission.duration_s,
         reference=reference,
         contains=lambda at_ne_m: not setup.fence_ne_m or is_inside(at_ne_m, setup.fence_ne_m),
         volume=setup.volume,
     )
+    return MissionStateMachine(setup.params.state_machine, mission)

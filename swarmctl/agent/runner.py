@@ -24,7 +24,7 @@ from swarmctl.bus.peers import Bus, LocalHub, agent_name
 from swarmctl.bus.relay import RelayingBus
 from swarmctl.bus.zenoh_bus import NO_BUS
 from swarmctl.config import Config, load, own_identity
-from swarmctl.control.phases.state_machine import OPERATOR_STOP
+from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Mode
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 from pydantic import Field
 
-from swarmctl.agent.path_sharing import PathSharingParams
+from swarmctl.agent.sharing.path_sharing import PathSharingParams
 from swarmctl.control.collision.barrier import BarrierParams
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import CommitParams
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.estimation.disturbance import DisturbanceParams
 from swarmctl.control.estimation.state_filter import StateFilterParams
+from swarmctl.control.failsafe.decision import FailsafeParams
+from swarmctl.control.failsafe.overload import OverloadParams
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.phases.failsafe import FailsafeParams
-from swarmctl.control.phases.overload import OverloadParams
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.reference.deadlock import DeadlockParams
 from swarmctl.control.reference.mission import MissionParams

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 from swarmctl.core.verdict import Verdict
 
@@ -27,3 +28,20 @@ def worst_first(found: Iterable[Finding]) -> list[Finding]:
     """Return all findings that are not OK, the worst first."""
     open_ones = [finding for finding in found if finding.verdict is not Verdict.OK]
     return sorted(open_ones, key=lambda f: (-f.verdict, -f.weight, f.agent))
+
+
+class Line(Protocol):
+    """Makes the finding of one row, whose topic and wanted value are given."""
+
+    def __call__(self, verdict: Verdict, found: str, advice: str = "", weight: int = 0) -> Finding: ...
+
+
+def line_of(agent: int, topic: str, wanted: str = "") -> Line:
+    """Return what makes the finding of a row that tells one of several things."""
+
+    def line(verdict: Verdict, found: str, advice: str = "", weight: int = 0) -> Finding:
+        return Finding(
+            agent=agent, topic=topic, verdict=verdict, found=found, wanted=wanted, advice=advice, weight=weight
+        )
+
+    return line

@@ -28,8 +28,8 @@ from mavsdk.plugins.geofence import FenceType, Geofence, GeofenceData, Point, Po
 from mavsdk.plugins.log_files import Entry, LogFiles, LogFilesError, LogFilesResult
 from mavsdk.plugins.param import Param
 
-from swarmctl.check.link_facts import ArmingProblem, FenceFacts, LatLon, VehicleLog
-from swarmctl.check.scanner import SCANNER_COMPID, VehicleScan
+from swarmctl.check.scan.link_facts import ArmingProblem, FenceFacts, LatLon, VehicleLog
+from swarmctl.check.scan.scanner import SCANNER_COMPID, VehicleScan
 from swarmctl.errors import StartError
 from swarmctl.mavlink.codec import Codec
 from swarmctl.wall_clock import monotonic_us

@@ -10,7 +10,7 @@ import math
 from dataclasses import replace
 
 from swarmctl.check.finding import Finding
-from swarmctl.check.link_facts import VehicleFacts
+from swarmctl.check.scan.link_facts import VehicleFacts
 from swarmctl.config import Config
 from swarmctl.core.types import Landed
 from swarmctl.core.verdict import Verdict

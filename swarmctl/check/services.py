@@ -7,7 +7,7 @@ from functools import partial
 import pymap3d
 
 from swarmctl.check.finding import Finding
-from swarmctl.check.link_facts import FenceFacts, LatLon, VehicleFacts
+from swarmctl.check.scan.link_facts import FenceFacts, LatLon, VehicleFacts
 from swarmctl.config import Config
 from swarmctl.core.verdict import Verdict
 from swarmctl.mavlink.dialects.discovery import DIALECTS

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from swarmctl.check.finding import SWARM, Finding
-from swarmctl.check.link_facts import Ned, VehicleFacts
 from swarmctl.check.parameters import parameter_findings
+from swarmctl.check.scan.link_facts import Ned, VehicleFacts
 from swarmctl.check.services import service_findings
-from swarmctl.check.vehicle import vehicle_findings
+from swarmctl.check.vehicle.findings import vehicle_findings
 from swarmctl.config import Config
 from swarmctl.core.types import Landed
 from swarmctl.core.verdict import Verdict

@@ -16,7 +16,7 @@ from rich.text import Text
 from swarmctl.bus.peers import agent_name
 from swarmctl.check.change import Change
 from swarmctl.check.finding import SWARM, Finding, worst_first
-from swarmctl.check.link_facts import VehicleFacts
+from swarmctl.check.scan.link_facts import VehicleFacts
 from swarmctl.core.text import printable
 from swarmctl.core.verdict import Verdict
 

@@ -12,9 +12,9 @@ from collections import deque
 from collections.abc import Mapping
 
 from swarmctl.core.types import Command, Verb
-from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.commands import CommandPort, CommandResult
 from swarmctl.mavlink.dialects.dialect import GPS_GLOBAL_ORIGIN, Dialect
+from swarmctl.mavlink.vehicle.autopilot import Autopilot
 
 _ORIGIN_EVERY_US = 1_000_000
 _ORIGIN_SOON_US = 200_000  # positions do not fit: there is no state until the origin is reported
@@ -127,7 +127,7 @@ class VehicleSetup:
         self._setup = {**self._dialect.given, **self._given}
         if self._dialect.heeds_parameter:
             self._setup[self._dialect.heeds_parameter] = self._sysid
-        self._watched_us, self._samples = now_us, autopilot.samples
+        self._watched_us, self._samples = now_us, autopilot.states.count
         origin = [Command(verb=Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)]
         reads = [Command(verb=Verb.PARAM_GET, name=n) for n in dict.fromkeys((*self._setup, *self._dialect.to_read()))]
         self._todo = deque(self._rates(self._dialect) + origin + reads)
@@ -168,8 +168,8 @@ class VehicleSetup:
         waited_us = now_us - self._watched_us
         if waited_us < self._watch_us:
             return
-        samples, received_us = self._autopilot.samples - self._samples, self._autopilot.received_us
-        self._watched_us, self._samples = now_us, self._autopilot.samples
+        samples, received_us = self._autopilot.states.count - self._samples, self._autopilot.received_us
+        self._watched_us, self._samples = now_us, self._autopilot.states.count
         enough = samples >= _ENOUGH_01 * self._rate_hz * waited_us * 1e-6
         silent = received_us is None or now_us - received_us > _SILENT_US
         if enough or silent:

@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from swarmctl import __version__
 from swarmctl.bus.peers import agent_name
-from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.check.parameters import unchangeable
-from swarmctl.check.scanner import run_scans
-from swarmctl.config import Config, MavlinkParams, load_recorded
+from swarmctl.check.scan.link_facts import VehicleFacts
+from swarmctl.check.scan.scanner import run_scans
+from swarmctl.config import Config, load_recorded
+from swarmctl.config_sections import MavlinkParams
 from swarmctl.errors import StartError
 from swarmctl.files import replaced
 from swarmctl.mavlink.dialects.discovery import DIALECTS

@@ -17,8 +17,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.check.listener import NOWHERE, Address, Listener, open_listener
-from swarmctl.check.scanner import ARMED_FLAG, AUTOPILOT_COMPID, SCANNER_COMPID
+from swarmctl.check.scan.listener import NOWHERE, Address, Listener, open_listener
+from swarmctl.check.scan.scanner import ARMED_FLAG, AUTOPILOT_COMPID, SCANNER_COMPID
 from swarmctl.config import Config
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START, ConfigError
 from swarmctl.mavlink.codec import Codec

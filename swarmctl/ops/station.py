@@ -17,7 +17,7 @@ from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import OBSTACLES, TICK
 from swarmctl.config import Config, own_identity
-from swarmctl.control.phases.state_machine import OPERATOR_STOP
+from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.records import unpack_tick
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swarmctl.check.change import Change
-from swarmctl.check.link_facts import ArmingProblem, FenceFacts, VehicleFacts
 from swarmctl.check.parameters import Number, changes, unchangeable
-from swarmctl.check.scanner import VehicleScan, run_scans
+from swarmctl.check.scan.link_facts import ArmingProblem, FenceFacts, VehicleFacts
+from swarmctl.check.scan.scanner import VehicleScan, run_scans
 from swarmctl.check.services import corners_deg, has_fence, wants_fence
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import as_json, print_check

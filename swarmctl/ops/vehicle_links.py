@@ -14,12 +14,12 @@ from functools import partial
 from pathlib import Path
 
 from swarmctl.bus.zenoh_bus import SCHEME
-from swarmctl.check.link_facts import VehicleFacts
-from swarmctl.check.listener import NOWHERE, Address, Listener, UdpListener, open_listener
 from swarmctl.check.parameters import names_to_read
-from swarmctl.check.scan_facts import facts_of, unreached
-from swarmctl.check.scanner import SCANNER_COMPID, VehicleScan
-from swarmctl.check.signed_listener import SignedListener
+from swarmctl.check.scan.link_facts import VehicleFacts
+from swarmctl.check.scan.listener import NOWHERE, Address, Listener, UdpListener, open_listener
+from swarmctl.check.scan.scan_facts import facts_of, unreached
+from swarmctl.check.scan.scanner import SCANNER_COMPID, VehicleScan
+from swarmctl.check.scan.signed_listener import SignedListener
 from swarmctl.config import Config
 from swarmctl.core.types import GeoOrigin
 from swarmctl.errors import StartError

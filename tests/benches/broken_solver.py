@@ -34,7 +34,7 @@ def break_solver(running: Lockstep, agent: int, lasts_s: float, spoil: Spoil = n
     until_s = running.clock.now_us() * 1e-6 + lasts_s
     flown = running.agents[agent]
     assert flown is not None
-    planner = flown._controller
+    planner = flown._planner.controller
     assert isinstance(planner, SwarmMpc)
     for solver in (planner._xy.session.solver, planner._xy_alone.session.solver):
         solver.solve = partial(_solve, running, until_s, spoil, solver.solve)  # type: ignore[method-assign]

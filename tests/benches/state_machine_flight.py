@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from swarmctl.control.phases.failsafe import NOTHING_WORN
+from swarmctl.control.failsafe.decision import NOTHING_WORN
 from swarmctl.control.phases.inputs import PeerInputs, PhaseInputs
+from swarmctl.control.phases.mission_state import MissionSetup
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.reference.mission import MissionParams, MissionReference
@@ -29,9 +30,16 @@ class Flight:
     def __init__(self, peers: int = 1, **params: Any) -> None:
         mission = MissionReference(MissionParams(kind="line"), START[None, :], 0)
         told = StateMachineParams(**params)
-        self.state_machine = MissionStateMachine(
-            told, 0, peers, RADIUS_M + told.apart_m, start_ned_m=START, duration_s=DURATION_S, reference=mission
+        setup = MissionSetup(
+            agent=0,
+            peers=peers,
+            landing_m=RADIUS_M + told.apart_m,
+            start_ned_m=START,
+            duration_s=DURATION_S,
+            reference=mission,
         )
+        self.state_machine = MissionStateMachine(told, setup)
+        self.mission = self.state_machine.mission
         self.now_us = 0
         self.pos, self.vel = np.array([1.0, 0.0, 0.0]), np.zeros(3)
         self.armed, self.flight_mode, self.landed = False, FlightMode.HOLD, ON_GROUND
@@ -56,7 +64,7 @@ class Flight:
 
     @property
     def phase(self) -> Phase:
-        return self.state_machine.phase
+        return self.mission.phase
 
     @property
     def at(self) -> str:
@@ -180,5 +188,5 @@ def controlled(phase: Phase) -> Flight:
         flight.pos = START + np.array([3.0, 0.0, 0.0])
         flight.until(phase)
     assert flight.phase is phase
-    assert flight.state_machine.had_control
+    assert flight.mission.had_control
     return flight

@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import development as dialect
 
 from sitl.lockstep import Lockstep
 from swarmctl.bus.peers import PeerPaths
+from swarmctl.control.mpc import judgement
 from swarmctl.control.mpc import swarm_mpc as mpc
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from swarmctl.mavlink.codec import Codec
@@ -175,7 +176,7 @@ def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: py
     monkeypatch.setattr(mpc, "half_spaces", lambda *_, **__: None)
     unfiltered = (AIR, "agent.barrier.enabled=false")
     certified = fly("mission.duration_s=8", *unfiltered, until=mission_is_over).separation_m()
-    monkeypatch.setattr(mpc, "certify", lambda *_, **__: 1.0)
+    monkeypatch.setattr(judgement, "certify", lambda *_, **__: 1.0)
     uncertified = fly("mission.duration_s=5", *unfiltered, until=closer_than(0.3)).separation_m()
     assert uncertified < 0.3 < 0.6 < certified
 

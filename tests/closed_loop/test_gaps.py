@@ -8,9 +8,9 @@ from pymavlink.dialects.v20 import development as dialect
 
 from sitl.lockstep import Lockstep
 from sitl.px4.link.endpoint import Endpoint
-from swarmctl.agent.coordination import Coordination
+from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.core.types import FlightMode, Mode, Phase
-from swarmctl.mavlink.autopilot import Autopilot
+from swarmctl.mavlink.vehicle.autopilot import Autopilot
 from swarmctl.simulator_config import FaultParams
 from tests.closed_loop.conftest import Flight, Fly
 

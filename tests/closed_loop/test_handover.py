@@ -14,13 +14,14 @@ from pymavlink.dialects.v20 import development as mavlink
 from sitl.lockstep import Lockstep
 from swarmctl.agent.agent import Agent
 from swarmctl.config import load
-from swarmctl.control.phases import state_machine
-from swarmctl.control.phases.state_machine import REBOOTED, TAKEN_OVER, MissionStateMachine
+from swarmctl.control.phases import handover, obeyed_orders
+from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
+from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.core.types import FlightMode, Phase, VehicleState
-from swarmctl.mavlink import mode_watch
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import PipeTransport
+from swarmctl.mavlink.vehicle import mode_watch
 from tests.closed_loop.conftest import Fly, closer_than, mission_t_s
 
 SETPOINT = 82  # SET_ATTITUDE_TARGET
@@ -52,11 +53,11 @@ def test_a_landing_at_speed_among_others_brakes_and_moves_apart_first(fly: Fly) 
 def test_negative_control_an_autopilot_that_lands_at_speed_among_others_comes_too_close(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def land_at_once(self: MissionStateMachine, now_us: int, state: VehicleState) -> None:
-        if self._stop_verb:
-            self.outcome, self.phase, self._entered_us = "stopped", Phase.LAND, now_us
+    def land_at_once(mission: MissionState, now_us: int, state: VehicleState) -> None:
+        if mission.stop_verb:
+            mission.outcome, mission.phase, mission.entered_us = "stopped", Phase.LAND, now_us
 
-    monkeypatch.setattr(MissionStateMachine, "_apply_stop", land_at_once)
+    monkeypatch.setattr(obeyed_orders, "apply_stop", land_at_once)
     assert fly(*CROSSING, at=LAND_NOW, until=closer_than(0.75)).separation_m() < 0.75
 
 
@@ -168,8 +169,8 @@ def test_a_restarted_agent_leaves_control_to_an_active_failsafe() -> None:
 
 def test_negative_control_streaming_to_a_vehicle_that_is_not_ours_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def switch_off() -> None:
-        monkeypatch.setattr(state_machine, "_is_under_other_control", lambda state: False)
-        monkeypatch.setattr(MissionStateMachine, "_request_control", lambda *_, **__: [])  # streaming is enough
+        monkeypatch.setattr(handover, "is_under_other_control", lambda state: False)
+        monkeypatch.setattr(handover, "request_control", lambda *_, **__: [])  # streaming is enough
 
     flight = restarted_while_the_autopilot_flies_home(switch_off)
     assert flight.setpoints_us

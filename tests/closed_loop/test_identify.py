@@ -80,4 +80,4 @@ def test_a_vehicle_that_is_too_fast_lands(limit: str, outcome: str) -> None:
     assert outcome in flight.agents[0].outcome
     last = flight.logs[0].ticks[-1]
     assert (last["phase"], last["armed"]) == (Phase.DONE, 0)
-    assert flight.agents[0]._autopilot.landed is Landed.ON_GROUND
+    assert flight.agents[0]._ports.autopilot.landed is Landed.ON_GROUND

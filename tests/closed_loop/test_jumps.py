@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from swarmctl.mavlink.local_frame import LocalFrame
+from swarmctl.mavlink.vehicle.local_frame import LocalFrame
 from tests.closed_loop.conftest import Flight, Fly, closer_than
 
 JUMP_M = 5.0

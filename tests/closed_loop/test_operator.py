@@ -69,8 +69,8 @@ def test_the_fence_of_the_configuration_is_that_of_goto() -> None:
     for settings, inside in (((), True), ((fence,), False)):
         (agent,) = Lockstep(load(None, ("swarm.agents=1", *settings))).agents
         assert agent is not None
-        assert agent._state_machine._contains((0.0, 19.0))
-        assert agent._state_machine._contains((0.0, 21.0)) is inside
+        assert agent._mission.contains((0.0, 19.0))
+        assert agent._mission.contains((0.0, 21.0)) is inside
 
 
 @pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])

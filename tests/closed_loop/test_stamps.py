@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import development as dialect
 from sitl.lockstep import Lockstep
 from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.vehicle_clock import VehicleClock
+from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 from tests.closed_loop.conftest import Flight, Fly
 
 OFFS_US = (-30_000_000, -1_500_000, 200_000, 900_000, 10**12)

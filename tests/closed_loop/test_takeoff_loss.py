@@ -9,9 +9,9 @@ import pytest
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from swarmctl.core.types import FlightMode, Phase
-from swarmctl.mavlink import autopilot
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.dialects.px4 import PX4
+from swarmctl.mavlink.vehicle import autopilot
 
 PHASES = [Phase.ARM, Phase.TAKEOFF]
 

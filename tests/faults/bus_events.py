@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from swarmctl.agent.coordination import Coordination
-from swarmctl.agent.separation_policy import Guaranteed
-from swarmctl.agent.world_model import WorldModel
+from swarmctl.agent.planning.coordination import Coordination
+from swarmctl.agent.planning.separation_policy import Guaranteed
+from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus.path_messages import decode_path, encode_path
 from swarmctl.bus.peers import PeerPaths, agent_name
 from swarmctl.bus.senders import SenderVerifier
 from swarmctl.bus.topics import PATH, Topic
 from swarmctl.core.types import Array, PredictedPath
-from tests.closed_loop.test_guaranteed import only_seen
+from tests.closed_loop.test_guaranteed_cut_off import only_seen
 from tests.faults.row import Off
 from tests.faults.simulated import VICTIM, Holds, Scene
 

@@ -21,8 +21,8 @@ import psutil
 
 import swarmctl
 from swarmctl.errors import SwarmError
+from tests.benches.launches import Launched
 from tests.faults.row import Off, Played, Row, require
-from tests.process.test_launch import Launched
 
 _GRID_US = 20_000
 

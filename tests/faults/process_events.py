@@ -9,15 +9,11 @@ import sys
 import threading
 import time
 
+from tests.benches.launches import AIR, NEAR, TWO
 from tests.faults.launched import Bounded, Start
 from tests.faults.row import Off, require
 from tests.process.test_check import ENV, ROOT, Pilot, Simulator
-from tests.process.test_launch import (
-    AIR,
-    NEAR,
-    TWO,
-    killed_part,
-)
+from tests.process.test_launch import killed_part
 
 VIEWED = ("--agents", "2", "--no-view")
 

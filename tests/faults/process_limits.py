@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 
+from tests.benches.launches import NEAR, TWO
 from tests.faults.launched import Bounded, Start
 from tests.faults.process_events import (
     ROUTER,
@@ -22,10 +23,6 @@ from tests.faults.process_events import (
     tracking,
 )
 from tests.faults.row import require
-from tests.process.test_launch import (
-    NEAR,
-    TWO,
-)
 
 
 @contextmanager

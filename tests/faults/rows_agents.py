@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from swarmctl import wall_clock
-from swarmctl.agent import coordination
+from swarmctl.agent.planning import coordination
 from swarmctl.bus.peers import agent_name
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.wall_clock import WallClock

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from swarmctl.agent import coordination, world_model
-from swarmctl.agent.coordination import Coordination
+from swarmctl.agent.planning import coordination
+from swarmctl.agent.planning.coordination import Coordination
+from swarmctl.agent.sensing import world_model
 from swarmctl.bus import inboxes, peers
 from swarmctl.bus.peers import PeerPaths
 from tests.faults.bus_events import (

@@ -119,7 +119,7 @@ ROWS = tuple(
             "both come to rest",
             12.0,
             "who is silent is waited for",
-            "test_guaranteed.py",
+            "test_guaranteed_cut_off.py",
             "two_halves_that_are_cut_off_from_each_other_both_come_to_rest",
             "negative_control_halves_that_take_missing_tokens_for_deaths_collide",
         ),

@@ -104,7 +104,7 @@ ROWS = (
         script=agent_starved,
         off=in_program(
             "agent",
-            "import swarmctl.control.phases.overload as it\nit.Overload.update = lambda *_: None",
+            "import swarmctl.control.failsafe.overload as it\nit.Overload.update = lambda *_: None",
         ),
     ),
     LaunchedRow(
@@ -154,7 +154,7 @@ ROWS = (
         script=simulator_started_again,
         off=in_program(
             "agent",
-            "import swarmctl.mavlink.vehicle_clock as it\n"
+            "import swarmctl.mavlink.vehicle.vehicle_clock as it\n"
             "it.VehicleClock.boots = property(lambda self: 0, lambda self, count: None)",
         ),
     ),

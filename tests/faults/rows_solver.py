@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from swarmctl.control.mpc import condensed, swarm_mpc
+from swarmctl.control.mpc import condensed, judgement
 from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus
 from tests.benches.broken_solver import Spoil, break_solver, no_answer, not_numbers, wrong_answer
 from tests.faults.row import Off
@@ -99,7 +99,7 @@ ROWS = (
         happens=_all_wrong,
         reacts=lambda scene: any(scene.tick(i)["plan_status"] == PlanStatus.RESIDUAL for i in range(4)),
         lasts_s=4.0,
-        off=Off(patches=((swarm_mpc, "RESIDUAL_LIMIT_M", float("inf")),)),
+        off=Off(patches=((judgement, "RESIDUAL_LIMIT_M", float("inf")),)),
     ),
     SimulatedRow(
         name="solver-among-others",

@@ -7,13 +7,15 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.control.phases import failsafe, state_machine
-from swarmctl.control.phases.state_machine import REBOOTED, MissionStateMachine
+from swarmctl.control.failsafe import decision
+from swarmctl.control.phases import handover
+from swarmctl.control.phases.mission_state import MissionState
+from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.core.types import Mode, Phase
-from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.local_frame import LocalFrame
-from swarmctl.mavlink.vehicle_clock import VehicleClock
+from swarmctl.mavlink.vehicle.local_frame import LocalFrame
+from swarmctl.mavlink.vehicle.state_samples import StateSamples
+from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 from tests.closed_loop.conftest import COARSE
 from tests.faults.row import Off
 from tests.faults.rows_agents import lands
@@ -23,12 +25,12 @@ STALE_FLOWN = Off(settings=("agent.failsafe.state_max_age_s=5",))
 ALWAYS_OURS = Off(  # neither the failsafe's table nor the state machine looks at who flies
     patches=(
         (
-            failsafe,
+            decision,
             "_TABLE",
-            tuple(row for row in failsafe._TABLE if row[0].__name__ not in ("_taken_over", "_overridden")),
+            tuple(row for row in decision._TABLE if row[0].__name__ not in ("_taken_over", "_overridden")),
         ),
-        (state_machine, "_is_under_other_control", lambda state: False),
-        (MissionStateMachine, "_override", lambda *_: None),
+        (handover, "is_under_other_control", lambda state: False),
+        (MissionState, "override", lambda *_: None),
     )
 )
 
@@ -84,12 +86,12 @@ def _unchecked(codec: Codec, frame: bytes) -> bytes | None:
     return bytes(frame[10 : 10 + frame[1]]).ljust(size, b"\0")[:size]
 
 
-def _as_it_comes(self: Autopilot, vehicle_us: int, arrived_us: int, *values: Any, **more: Any) -> bool:
+def _as_it_comes(self: StateSamples, vehicle_us: int, arrived_us: int, *values: Any, **more: Any) -> bool:
     """Take a state for as new as its arrival."""
     return _TAKE(self, arrived_us, arrived_us, *values, **more)
 
 
-_TAKE = Autopilot._take
+_TAKE = StateSamples._take
 FROM_THE_GROUND = (*COARSE, "swarm.agents=2", "start.spacing_m=4", "mission.kind=line", "mission.duration_s=60")
 MOBILE = (*SWAP, "sitl.battery.capacity_mah=3000", "agent.failsafe.window_s=1")
 
@@ -155,7 +157,7 @@ ROWS = (
         ),
         reacts=lambda scene: scene.since_s > 7.5,
         lasts_s=8.0,
-        off=Off(patches=((Autopilot, "_take", _as_it_comes),)),
+        off=Off(patches=((StateSamples, "_take", _as_it_comes),)),
     ),
     SimulatedRow(
         name="link-corrupt",

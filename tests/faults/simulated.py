@@ -110,7 +110,7 @@ class Scene:
 
     def waits(self, i: int) -> bool:
         """Whether an agent rests because it does not hear a peer."""
-        return self.agent(i)._state_machine._interruptions.paused
+        return self.agent(i)._mission.interruptions.paused
 
     def all_arrived(self) -> bool:
         """Whether every vehicle rests opposite of where it began."""

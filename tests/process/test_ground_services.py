@@ -16,8 +16,8 @@ import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.check.ground_services import GroundServices, GroundVehicle, open_services
-from swarmctl.check.listener import open_listener
-from swarmctl.check.scanner import VehicleScan, run_scans
+from swarmctl.check.scan.listener import open_listener
+from swarmctl.check.scan.scanner import VehicleScan, run_scans
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.transport import bind_udp
 from swarmctl.wall_clock import monotonic_us

@@ -18,8 +18,8 @@ from swarmctl.core.records import TRUTH_COLUMNS
 from swarmctl.ops.cli import main
 from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, read_parquet
 from tests.benches.free_ports import free_ports
+from tests.benches.launches import Launched
 from tests.process.test_bus import until
-from tests.process.test_launch import Launched
 from tests.process.test_readme import shown
 
 pytestmark = pytest.mark.process

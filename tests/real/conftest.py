@@ -15,7 +15,7 @@ from typing import IO
 import psutil
 import pytest
 
-from tests.process.test_launch import Launched
+from tests.benches.launches import Launched
 from tests.real.autopilots import Fleet, Kind
 from tests.real.network import Network, own_network
 from tests.real.witness import Truth, Witness

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from swarmctl.core.types import Phase
-from tests.process.test_launch import Launched
+from tests.benches.launches import Launched
 from tests.real.autopilots import ARDUCOPTER, PX4
 from tests.real.conftest import Field, Fielder
 from tests.real.witness import Seen

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION
-from tests.process.test_launch import Launched
+from tests.benches.launches import Launched
 from tests.real.autopilots import PX4
 from tests.real.conftest import Field, Fielder
 from tests.real.test_flights import BODIES_M, END_S, GROUND_S, PX4_CONFIG

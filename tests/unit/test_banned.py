@@ -27,7 +27,7 @@ def test_not_in_the_code(pattern: str, why: str) -> None:
 def test_setpoints_are_packed_in_one_place() -> None:
     packing = r"set_attitude_target_message\(|frame\(mavlink\.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET"
     packers = [path.name for path in SOURCES if re.search(packing, code_of(path))]
-    assert packers == ["autopilot.py"]
+    assert packers == ["setpoint_stream.py"]
 
 
 def code_of(path: Path) -> str:

@@ -12,7 +12,7 @@ import pytest
 import swarmctl
 from sitl.studies.campaign.trials import SCHEMA
 from sitl.studies.sweep.figures import schema_of
-from swarmctl.config import SitlParams
+from swarmctl.config_sections import SitlParams
 from swarmctl.control.controllers.own import GROUP as CONTROLLERS_OFFERED
 from swarmctl.control.reference.mission import GROUP as MISSIONS_OFFERED
 from swarmctl.core.operator_verbs import OPERATOR_VERBS

@@ -93,8 +93,8 @@ def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = MOST_PR
     agents = [agent for agent in flight.agents if agent is not None]
     recordings = []
     for agent in agents:
-        recordings.append(Recording(agent._controller))
-        agent._controller = recordings[-1]  # only tracking is recorded, so `_transit` stays
+        recordings.append(Recording(agent._planner.controller))
+        agent._planner.controller = recordings[-1]  # only tracking is recorded, so `_transit` stays
     found: list[list[tuple[Problem, float]]] = [[] for _ in agents]
 
     def enough(flown: Lockstep) -> bool:

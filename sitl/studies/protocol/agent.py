@@ -134,7 +134,7 @@ class Agent:
             yield TAKEN_OVER, after, self._says(after, known)
 
     def _tick(self, before: Process, known: Known, suspected: frozenset[int]) -> Iterator[Outcome]:
-        """Yield the outcomes of one tick, in the order of `swarmctl.agent.coordination`."""
+        """Yield the outcomes of one tick, in the order of `swarmctl.agent.planning.coordination`."""
         membership = self._rules.membership(self._number, self._peers)
         membership._promised, membership.excluded = before.promised, before.excluded
         others = frozenset(range(AGENTS))

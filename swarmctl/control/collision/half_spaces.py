@@ -63,17 +63,33 @@ def half_spaces(
         normal[:, :, 2] *= known.vertical_01  # back from scaled to true heights
     offset = np.einsum("skc,skc->sk", normal, others) + needed
     idle = (needed <= 0.0) | (distance > needed + params.gate_m)
-    last = normal[:, -1]  # (keep-outs, axes)
-    ends = (others[:, -1] - others[:, -2]) / dt_s  # (keep-outs, axes) velocity of each keep-out at the end
-    closing = -np.einsum("sc,sc->s", last, vel_m_s - ends)
-    stop_s = np.maximum(closing, 0.0) / (2.0 * params.stop_m_s2)
-    squeezed = [i for i, k in enumerate(known) if k.downwash > 1.0 and not k.any_height]
-    if squeezed:  # braking is scaled likewise
-        stop_s[squeezed] /= np.maximum(np.linalg.norm(last[squeezed], axis=1), _TINY_M)
-    stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", last, ends)
+    stop_s, moved_m = _stops(known, normal[:, -1], others, vel_m_s, dt_s=dt_s, stop_m_s2=params.stop_m_s2)
+    stop_offset = offset[:, -1] + moved_m
     offset[idle] = -np.inf
     stop_offset[idle[:, -1]] = -np.inf
     return HalfSpaces(normal=normal, offset_m=offset, stop_s=stop_s, stop_offset_m=stop_offset)
+
+
+def _stops(
+    known: KeepOuts, last: Array, others: Array, vel_m_s: Array, *, dt_s: float, stop_m_s2: float
+) -> tuple[Array, Array]:
+    """Return how long braking takes towards each keep-out at the end, and how far each moves away meanwhile, (slots,).
+
+    Args:
+        known: the keep-outs.
+        last: (slots, axes) normals at the last step.
+        others: (slots, Hp, axes) places of the keep-outs.
+        vel_m_s: (axes,) own velocity at the first point.
+        dt_s: time between points.
+        stop_m_s2: see `SeparationParams`.
+    """
+    ends = (others[:, -1] - others[:, -2]) / dt_s  # (keep-outs, axes) velocity of each keep-out at the end
+    closing = -np.einsum("sc,sc->s", last, vel_m_s - ends)
+    stop_s = np.maximum(closing, 0.0) / (2.0 * stop_m_s2)
+    squeezed = [i for i, k in enumerate(known) if k.downwash > 1.0 and not k.any_height]
+    if squeezed:  # braking is scaled likewise
+        stop_s[squeezed] /= np.maximum(np.linalg.norm(last[squeezed], axis=1), _TINY_M)
+    return stop_s, stop_s * np.einsum("sc,sc->s", last, ends)
 
 
 def _part_coincident(normal: Array, distance: Array, has_priority: Sequence[bool]) -> None:

@@ -119,7 +119,7 @@ class Planner(Protocol):
 
 
 class Commitments:
-    """Applies rules 2 to 4 for one agent; `swarmctl.agent.coordination` receives and publishes the messages.
+    """Applies rules 2 to 4 for one agent; `swarmctl.agent.planning.coordination` receives and publishes the messages.
 
     Args:
         agent: own number.

@@ -18,8 +18,9 @@ from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces, Penalties
 from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.judgement import judged
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.swarm_mpc import MpcParams, faces_along, first_guess, judged, near_half_spaces, planned
+from swarmctl.control.mpc.swarm_mpc import MpcParams, faces_along, first_guess, near_half_spaces, planned
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array, Plan

@@ -17,19 +17,17 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.collision.half_spaces import half_spaces
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, certify, stacked
-from swarmctl.control.collision.volume_certificate import volume_margin_m
+from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, stacked
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Faces, HalfSpaces, Horizon, Penalties, Terminal
 from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.judgement import judged
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
-from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes
-
-RESIDUAL_LIMIT_M = 0.05  # a solution that violates a constraint by more is refused; the certificate checks the rest
+from swarmctl.core.types import Array, Plan, PlanStatus
 
 
 class AxisWeights(Params):
@@ -330,65 +328,3 @@ def _relaxed(separation: SeparationParams) -> Iterator[SeparationParams]:
 
 def _are_equal(one: HalfSpaces, other: HalfSpaces) -> bool:
     return np.array_equal(one.offset_m, other.offset_m) and np.array_equal(one.stop_s, other.stop_s)
-
-
-def judged(
-    problem: Problem,
-    pos_ned_m: Array,
-    vel_ned_m_s: Array,
-    virtual_control: Array,
-    *,
-    solutions: Sequence[AxesSolution],
-    from_step: int,
-    dt_us: int,
-    began_ns: int,
-    spaces_us: float,
-    stopwatch_ns: Callable[[], int],
-    volume: FlightVolume | None,
-) -> Plan:
-    """Return the plan with its status: whether it is solved, within the residual limit, and certified.
-
-    Args:
-        problem: the problem it solves.
-        pos_ned_m, vel_ned_m_s: (steps+1, 3) from the start on.
-        virtual_control: (steps, 3).
-        solutions: solutions of all problems solved for it.
-        from_step: first certified step; earlier ones cannot be changed any more.
-        dt_us: step.
-        began_ns: stopwatch reading at the start of planning.
-        spaces_us: time that half-spaces took.
-        stopwatch_ns: see `CondensedMpc`.
-        volume: to stay in; None for none.
-    """
-    residual_m = max([s.residual_m for s in solutions])
-    solved_ns = stopwatch_ns()
-    status = PlanStatus.OK
-    if not all(s.solved for s in solutions):
-        status = PlanStatus.SOLVER_FAILED
-    elif residual_m > RESIDUAL_LIMIT_M:
-        status = PlanStatus.RESIDUAL
-    elif (
-        certify(pos_ned_m, problem.keep_outs, from_step) < 0.0
-        or volume_margin_m(volume, pos_ned_m, vel_ned_m_s, from_step) < 0.0
-    ):
-        status = PlanStatus.NOT_CERTIFIED
-    solve_us = sum([s.solve_us for s in solutions])
-    certify_us = (stopwatch_ns() - solved_ns) * 1e-3
-    return Plan(
-        status=status,
-        t0_us=problem.start.t_us,
-        dt_us=dt_us,
-        pos_ned_m=pos_ned_m,
-        vel_ned_m_s=vel_ned_m_s,
-        virtual_control=virtual_control,
-        times=PlanTimes(
-            setup_us=(solved_ns - began_ns) * 1e-3 - solve_us - spaces_us,
-            solve_us=solve_us,
-            certify_us=certify_us,
-            spaces_us=spaces_us,
-        ),
-        iterations=sum([s.iterations for s in solutions]),
-        slack_m=max([s.slack_m for s in solutions]),
-        residual_m=residual_m,
-        terminal_gap_m=max([s.terminal_gap_m for s in solutions]),
-    )

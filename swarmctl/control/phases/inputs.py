@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from swarmctl.control.phases.failsafe import NOTHING_WORN, Escalation
-from swarmctl.control.phases.overload import Level
+from swarmctl.control.failsafe.decision import NOTHING_WORN, Escalation
+from swarmctl.control.failsafe.overload import Level
 from swarmctl.core.types import Array, FlightMode, Mode, Phase, VehicleState
 
 

@@ -1,6 +1,6 @@
 """Which operator's orders an agent refuses, and the reason it answers. Pure.
 
-An order that is not refused has its effect: `control.phases.state_machine` applies it.
+An order that is not refused has its effect: `control.phases.obeyed_orders` applies it.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from swarmctl.bus.topics import OPERATOR, Topic
 from swarmctl.config import Config
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
 from swarmctl.control.model import Predictor
-from swarmctl.control.phases.state_machine import BEGIN_DELAY_US
+from swarmctl.control.phases.steps.tracking import BEGIN_DELAY_US
 from swarmctl.core.operator_verbs import MISSION, OPERATOR_VERBS
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, PredictedPath, VehicleState
 from swarmctl.mavlink.commands import OWN_COMPID

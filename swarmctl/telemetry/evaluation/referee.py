@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,8 +18,15 @@ from numpy.typing import NDArray
 from swarmctl import __version__
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import Array, Mode, Phase, PlanStatus
-from swarmctl.telemetry.evaluation.reception import refused_peers, unresponsive
+from swarmctl.core.types import Phase
+from swarmctl.telemetry.evaluation.reception import refused_peers
+from swarmctl.telemetry.evaluation.run_counts import (
+    commitment_counts,
+    communication,
+    deadlock_counts,
+    percentiles,
+    solver_counts,
+)
 from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
@@ -32,8 +38,6 @@ from swarmctl.telemetry.evaluation.tracks import (
 )
 from swarmctl.telemetry.json_safe import finite, json_safe
 
-_CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
-_SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
 SUMMED_ERROR = "distances of all agents to their reference, added up; mean over the mission"  # what `index_m` is
 _MAX_LISTED = 10  # largest number of violations of one kind listed in full
 _DURATION_SLACK_S = 1.0  # mission time that may be missing at the end of a completed run
@@ -117,10 +121,10 @@ def evaluate(
         "obstacles": obstacles,
         "volume": volume,
         "timing": timing,
-        "solver": _solver(run.ticks, rules.solver_name),
-        "comms": _comms(run, tracks.time_field),
-        "deadlocks": _deadlocks(run.events),
-        "commitments": _commitments(run.events),
+        "solver": solver_counts(run.ticks, rules.solver_name),
+        "comms": communication(run.ticks, run.events, tracks.time_field),
+        "deadlocks": deadlock_counts(run.events),
+        "commitments": commitment_counts(run.events),
     }
     result: dict[str, Any] = json_safe(summary)
     return result
@@ -274,8 +278,8 @@ def _evaluate_timing(
         "ticks": total,
         "due_ticks": due,
         "late_ticks": late,
-        "tick_ms": _percentiles([rows["tick_ms"] for rows in flights]),
-        "solve_ms": _percentiles([rows["solve_ms"][rows["iterations"] > 0] for rows in flights]),
+        "tick_ms": percentiles([rows["tick_ms"] for rows in flights]),
+        "solve_ms": percentiles([rows["solve_ms"][rows["iterations"] > 0] for rows in flights]),
         "speed_factor": speed_factor,
     }
     if due and late > rules.deadline_misses_01 * due:
@@ -323,83 +327,6 @@ def _summed_mean_error_m(errors: Mapping[int, Any], first_s: float, last_s: floa
     return total_m
 
 
-def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
-    """Count solver failures while the agent had control, and find the largest residual of a plan that was flown."""
-    flights = [flight_rows(rows) for rows in ticks.values()]
-    charged = [rows[np.isin(rows["mode"], _CONTROLLED)] for rows in flights]
-    residuals = [
-        rows["residual_m"][(rows["iterations"] > 0) & (rows["plan_status"] == PlanStatus.OK)] for rows in flights
-    ]
-    return {
-        "name": name,
-        "failed": sum(int(np.isin(rows["plan_status"], _SOLVER_FAILED).sum()) for rows in charged),
-        "not_certified": sum(int((rows["plan_status"] == PlanStatus.NOT_CERTIFIED).sum()) for rows in charged),
-        "max_residual_m": _percentiles(residuals)["max"],
-        "safety_filter_ticks": sum(int(rows["safety_filter_acted"].sum()) for rows in flights),
-    }
-
-
-def _comms(run: RunData, time_field: str) -> dict[str, Any]:
-    """Summarise plan staleness, messages sent, messages and frames refused, unresponsive peers, sessions replaced."""
-    ages = _percentiles([flight_rows(rows)["plan_staleness_ms"] for rows in run.ticks.values()])
-    return {
-        "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
-        "sent": _sent(run.events),
-        "rejected": _refused(run.events, "bus_summary", "rejected"),
-        "refused_frames": _refused(run.events, "link_summary", "refused"),
-        "unresponsive": unresponsive(run.events, time_field),
-        "reopened": sum(event.get("event") == "bus_reopened" for event in run.events),
-    }
-
-
-def _last_of_each_source(events: Sequence[Mapping[str, Any]], name: str) -> Iterable[Mapping[str, Any]]:
-    return {event.get("source"): event for event in events if event.get("event") == name}.values()
-
-
-def _sent(events: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
-    """Add up messages and bytes by topic in the last summary of each agent."""
-    total: dict[str, Counter[str]] = {}
-    for summary in _last_of_each_source(events, "bus_summary"):
-        topics = summary.get("sent")
-        for topic, counts in topics.items() if isinstance(topics, dict) else ():
-            if isinstance(counts, dict):
-                found = {key: int(counts[key]) for key in ("messages", "bytes") if finite(counts.get(key)) is not None}
-                total.setdefault(str(topic), Counter()).update(found)
-    return {topic: dict(counts) for topic, counts in sorted(total.items())}
-
-
-def _refused(events: Sequence[Mapping[str, Any]], name: str, field: str) -> dict[str, int]:
-    """Add up the counts by reason in the last event of a name from each source."""
-    refused: Counter[str] = Counter()
-    for event in _last_of_each_source(events, name):
-        reasons = event.get(field)
-        if isinstance(reasons, dict):
-            refused.update({str(reason): int(n) for reason, n in reasons.items() if finite(n) is not None})
-    return dict(sorted(refused.items()))
-
-
-def _deadlocks(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Count deadlocks, those that were not resolved, and the longest duration."""
-    noticed = [event for event in events if event.get("event") == "deadlock"]
-    lasted_s = [seconds for event in noticed if (seconds := finite(event.get("lasted_s"))) is not None]
-    begun = sum(event.get("begins") is True for event in noticed)
-    return {"count": begun, "longest_s": max(lasted_s, default=None), "unresolved": begun - len(lasted_s)}
-
-
-def _commitments(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Sums over agents of what they counted by their last `commitments` event; None where nothing was guaranteed."""
-    last = {event.get("source"): event for event in events if event.get("event") == "commitments"}
-    if not last:
-        return None
-    names = ("proposed", "committed", "withdrawn", "expired", "unplanned", "evasive")
-    worst_m = max(finite(event.get("worst_tracking_m")) or 0.0 for event in last.values())
-    off = sum(event.get("event") == "tracking_violation" and event.get("begins") is True for event in events)
-    return {name: sum(int(finite(event.get(name)) or 0) for event in last.values()) for name in names} | {
-        "worst_tracking_m": worst_m,
-        "tracking_violation": off,
-    }
-
-
 def _not_a_number(truth: NDArray[np.void]) -> Iterator[str]:
     for vehicle in np.unique(truth["vehicle"][~np.isfinite(truth["pos_ned_m"]).all(axis=1)]):
         yield f"true position of agent {vehicle} is not a number: the simulation diverged"
@@ -415,16 +342,6 @@ def _cut_short(tracked_s: Mapping[int, float], rules: Rules, events: Sequence[Ma
         wanted_s = asked_s.get(f"agent-{agent}", rules.duration_s)
         if isinstance(wanted_s, int | float) and seconds < wanted_s - _DURATION_SLACK_S:
             yield f"mission time {seconds:.1f} s of agent {agent} below {wanted_s:g} s"
-
-
-def _percentiles(parts: Sequence[Array]) -> dict[str, float | None]:
-    """Return median, 99th percentile and maximum of the finite values."""
-    values = np.concatenate([np.asarray(part, np.float64) for part in parts]) if parts else np.zeros(0)
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return {"p50": None, "p99": None, "max": None}
-    p50, p99 = np.percentile(values, [50, 99])
-    return {"p50": float(p50), "p99": float(p99), "max": float(values.max())}
 
 
 def _shorten(violations: list[str]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from swarmctl.agent.alerts import Alerts
+from swarmctl.agent.watches.alerts import Alerts
 
 SECOND = 1_000_000
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarmctl.agent.coordination import Coordination
-from swarmctl.agent.world_model import WorldModel
+from swarmctl.agent.planning.coordination import Coordination
+from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.commitment_messages import decode_trajectory_message, encode_trajectory_message
 from swarmctl.bus.json_messages import encode_message

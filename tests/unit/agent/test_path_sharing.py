@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarmctl.agent.path_sharing import PathSharing, PathSharingParams
+from swarmctl.agent.sharing.path_sharing import PathSharing, PathSharingParams
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from swarmctl.agent.components import SEPARATION_MODES
-from swarmctl.agent.separation_policy import BestEffort, Guaranteed, SeparationInputs, SeparationPolicy
+from swarmctl.agent.planning.separation_policy import BestEffort, Guaranteed, SeparationInputs, SeparationPolicy
 from swarmctl.bus.peers import LocalBus
 from swarmctl.control.collision.separation import KeepOuts, SeparationParams
 from swarmctl.control.commit.trajectory_planner import DesiredReference

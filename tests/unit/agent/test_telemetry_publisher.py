@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmctl.agent.telemetry_publisher import percentile_99
+from swarmctl.agent.sharing.telemetry_publisher import percentile_99
 
 
 @given(st.lists(st.floats(0.0, 1e3), min_size=1, max_size=260))

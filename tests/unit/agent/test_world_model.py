@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from swarmctl.agent.world_model import WorldModel
+from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.json_messages import (
     MAX_OBSTACLES,

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from swarmctl.agent.world_model import WorldModel
+from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus.commitment_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.bus.json_messages import CommandMessage, encode_message, first_list
 from swarmctl.bus.network.identities import add_identity, make_identities, revoke_identity

@@ -15,7 +15,8 @@ from rich.console import Console
 
 from swarmctl.check.change import Change
 from swarmctl.check.finding import SWARM, Finding, worst_first
-from swarmctl.check.link_facts import (
+from swarmctl.check.parameters import RC_RECEIVER, changes, names_to_read, unchangeable
+from swarmctl.check.scan.link_facts import (
     ArmingProblem,
     Estimator,
     FenceFacts,
@@ -28,13 +29,12 @@ from swarmctl.check.link_facts import (
     VehicleTime,
     Version,
 )
-from swarmctl.check.parameters import RC_RECEIVER, changes, names_to_read, unchangeable
-from swarmctl.check.scan_facts import unreached
+from swarmctl.check.scan.scan_facts import unreached
 from swarmctl.check.services import corners_deg, has_fence
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import _drawn, as_json, print_check
 from swarmctl.config import Config, load
-from swarmctl.control.phases.failsafe import FailsafeParams
+from swarmctl.control.failsafe.decision import FailsafeParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.types import FlightMode, Landed
 from swarmctl.core.verdict import Verdict

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.check.link_facts import VehicleFacts
-from swarmctl.check.link_statistics import Answer, FrameStatistics, round_trip, vehicle_time
-from swarmctl.check.listener import NOWHERE, Address, ReceivedDatagram, UdpListener, open_listener
 from swarmctl.check.parameters import names_to_read
-from swarmctl.check.scan_facts import facts_of
-from swarmctl.check.scanner import ASKED, SCANNER_COMPID, VehicleScan
+from swarmctl.check.scan.link_facts import VehicleFacts
+from swarmctl.check.scan.link_statistics import Answer, FrameStatistics, round_trip, vehicle_time
+from swarmctl.check.scan.listener import NOWHERE, Address, ReceivedDatagram, UdpListener, open_listener
+from swarmctl.check.scan.scan_facts import facts_of
+from swarmctl.check.scan.scanner import ASKED, SCANNER_COMPID, VehicleScan
 from swarmctl.check.swarm import exit_code, findings
 from swarmctl.check.table import as_json
 from swarmctl.config import load
@@ -133,7 +133,7 @@ def run(scan: VehicleScan, vehicle: Vehicle, seconds: float, beating: bool = Tru
 @pytest.fixture
 def listener(monkeypatch: pytest.MonkeyPatch) -> ScriptedListener:
     scripted = ScriptedListener()
-    monkeypatch.setattr("swarmctl.check.scanner.monotonic_us", lambda: scripted.now_us)
+    monkeypatch.setattr("swarmctl.check.scan.scanner.monotonic_us", lambda: scripted.now_us)
     return scripted
 
 

@@ -10,11 +10,11 @@ import pytest
 from pymavlink.dialects.v20 import development as mav
 
 from sitl.world import SitlWorld
-from swarmctl.check.listener import Address, ReceivedDatagram
-from swarmctl.check.scan_facts import facts_of
-from swarmctl.check.scanner import SCANNER_COMPID, VehicleScan
-from swarmctl.check.signed_listener import SignedListener
-from swarmctl.check.vehicle import vehicle_findings
+from swarmctl.check.scan.listener import Address, ReceivedDatagram
+from swarmctl.check.scan.scan_facts import facts_of
+from swarmctl.check.scan.scanner import SCANNER_COMPID, VehicleScan
+from swarmctl.check.scan.signed_listener import SignedListener
+from swarmctl.check.vehicle.findings import vehicle_findings
 from swarmctl.config import load
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import GeoOrigin

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from swarmctl.config import load
-from swarmctl.control.phases.endurance import UNKNOWN, Endurance
-from swarmctl.control.phases.failsafe import Escalation, FailsafeParams, Response, escalate
+from swarmctl.control.failsafe.decision import Escalation, FailsafeParams, Response, escalate
+from swarmctl.control.failsafe.endurance import UNKNOWN, Endurance
 from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import ConfigError
 from tests.benches.state_machine_flight import START, Flight, controlled
@@ -116,23 +116,23 @@ def test_an_agent_flies_back_or_lands_where_it_is(phase: Phase, held: bool) -> N
             flight.ask("hold")
         worn(flight, asked)
         assert flight.phase is Phase.GOTO_LAND
-        assert flight.state_machine._landing.in_place is in_place
-        assert flight.state_machine.outcome.startswith("battery at 15 %")
-        assert not flight.state_machine.held
+        assert flight.mission.landing.in_place is in_place
+        assert flight.mission.outcome.startswith("battery at 15 %")
+        assert not flight.mission.held
 
 
 def test_on_the_way_back_it_lands_where_it_is_once_it_has_to() -> None:
     flight = worn(away(Phase.TRACK), RTL)
     worn(flight, RTL)
-    assert not flight.state_machine._landing.in_place
+    assert not flight.mission.landing.in_place
     worn(flight, LAND)
-    assert flight.state_machine._landing.in_place
+    assert flight.mission.landing.in_place
 
 
 def test_a_warning_changes_nothing() -> None:
     flight = worn(away(Phase.TRACK), WARN)
     assert flight.phase is Phase.TRACK
-    assert flight.state_machine.outcome == ""
+    assert flight.mission.outcome == ""
 
 
 @pytest.mark.parametrize("asked", [RTL, LAND])
@@ -140,8 +140,8 @@ def test_nothing_is_armed_with_a_battery_that_would_return_at_once(asked: Respon
     flight = worn(Flight(), asked)
     flight.run(10.0)
     assert flight.phase is Phase.DONE
-    assert not flight.state_machine.arming.requested
-    assert flight.state_machine.outcome == "battery at 15 %"
+    assert not flight.mission.arming.requested
+    assert flight.mission.outcome == "battery at 15 %"
 
 
 def test_a_pilot_is_left_alone() -> None:
@@ -150,4 +150,4 @@ def test_a_pilot_is_left_alone() -> None:
     flight.run(0.2)
     worn(flight, LAND)
     assert flight.phase is Phase.TRACK
-    assert flight.state_machine.pilot_override
+    assert flight.mission.pilot_override

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from swarmctl.control.phases.failsafe import FailsafeParams, decide
+from swarmctl.control.failsafe.decision import FailsafeParams, decide
 from swarmctl.core.types import FlightMode, Health, Landed, Mode, Phase, PlanStatus
 
 PARAMS = FailsafeParams()  # state 0.2 s, replay 0.4 s, hold 5 s, rest 0.2 m/s

@@ -12,9 +12,10 @@ from swarmctl.control.collision.separation import KeepOut, SeparationParams, cer
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.axes import AxesSolution
+from swarmctl.control.mpc.judgement import RESIDUAL_LIMIT_M
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.solvers.qp import QpParams
-from swarmctl.control.mpc.swarm_mpc import RESIDUAL_LIMIT_M, MpcParams, SwarmMpc, closest_keep_outs
+from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc, closest_keep_outs
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 from tests import builders
 

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from swarmctl.control.phases.state_machine import OPERATOR_STOP, TAKEN_OVER, MissionStateMachine
+from swarmctl.control.phases.mission_state import TAKEN_OVER
+from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP, ORDERS
 from swarmctl.control.phases.trajectories import OfferedMission
 from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.flight_volume import FlightVolume, VolumeParams
@@ -23,7 +24,7 @@ LONG_S = 120.0  # past every timeout
 
 def place(flight: Flight, after_s: float = 60.0) -> Array:
     """Return the reference `after_s` from now."""
-    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([after_s]))
+    pos, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.array([after_s]))
     return pos.ravel()
 
 
@@ -36,32 +37,32 @@ def is_held(flight: Flight) -> bool:
     asked |= set(flight.run(LONG_S))
     went_on = flight.phase is not before and (before, flight.phase) != (Phase.READY, Phase.TRACK)
     rests = before is Phase.TAKEOFF or np.linalg.norm(place(flight) - flight.pos) < 1.0
-    return flight.state_machine.held and asked <= allowed and not went_on and bool(rests)
+    return flight.mission.held and asked <= allowed and not went_on and bool(rests)
 
 
 def goes_on(flight: Flight) -> bool:
     """Whether nothing holds it."""
-    return not flight.state_machine.held
+    return not flight.mission.held
 
 
 def ends(flight: Flight) -> bool:
     """Whether it is on its way to land, or has landed."""
-    return flight.phase >= Phase.GOTO_LAND and flight.state_machine.outcome in (OPERATOR_STOP, "completed")
+    return flight.phase >= Phase.GOTO_LAND and flight.mission.outcome in (OPERATOR_STOP, "completed")
 
 
 def goes_there(flight: Flight) -> bool:
     """Whether it is on its way to the point, and stays there past every timeout."""
     flight.run(LONG_S)
-    return flight.state_machine.held and bool(np.allclose(place(flight), THERE))
+    return flight.mission.held and bool(np.allclose(place(flight), THERE))
 
 
 def flies_it(flight: Flight) -> bool:
     """Whether it flies the mission that is offered, to its end, and no other."""
     if flight.phase is Phase.TRACK:
-        pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([OFFERED.duration_s - 0.1]))
+        pos, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.array([OFFERED.duration_s - 0.1]))
     else:
-        pos = flight.state_machine._reference.sample(np.array([OFFERED.duration_s]))[0]
-    return bool(np.allclose(pos.ravel(), ELSEWHERE)) and flight.state_machine._duration_us == OFFERED.duration_s * 1e6
+        pos = flight.mission.mission_reference.sample(np.array([OFFERED.duration_s]))[0]
+    return bool(np.allclose(pos.ravel(), ELSEWHERE)) and flight.mission.duration_us == OFFERED.duration_s * 1e6
 
 
 ELSEWHERE = (9.0, 9.0, -3.0)
@@ -91,9 +92,9 @@ EFFECTS: dict[str, Callable[[Flight], bool]] = {
 @pytest.mark.parametrize("verb", ABOUT_THE_VEHICLE)
 def test_each_verb_in_each_phase_has_its_effect_or_is_refused_with_a_reason(verb: str, phase: Phase) -> None:
     flight = in_phase(phase)
-    machine = flight.state_machine
-    machine.offered = OFFERED
-    before = machine.phase, machine.held, machine.outcome
+    mission = flight.mission
+    mission.offered = OFFERED
+    before = mission.phase, mission.held, mission.outcome
     arguments = dict(ARGUMENTS.get(verb, {}))
     if BEGIN in arguments:
         arguments[BEGIN] = flight.utc_us * 1e-6
@@ -103,12 +104,11 @@ def test_each_verb_in_each_phase_has_its_effect_or_is_refused_with_a_reason(verb
         assert EFFECTS[verb](flight)
     else:
         assert refusal.startswith(f"it is in {phase.name}; {verb} is obeyed in ")
-        assert (machine.phase, machine.held, machine.outcome) == before
+        assert (mission.phase, mission.held, mission.outcome) == before
 
 
 def test_every_verb_about_the_vehicle_is_a_stop_or_handled() -> None:
-    machine: MissionStateMachine = Flight().state_machine
-    assert {name for name in ABOUT_THE_VEHICLE if not OPERATOR_VERBS[name].is_stop} == machine._order_handlers.keys()
+    assert {name for name in ABOUT_THE_VEHICLE if not OPERATOR_VERBS[name].is_stop} == ORDERS.keys()
 
 
 def test_verbs_of_flight_are_obeyed_wherever_the_agent_decides_and_nothing_interrupts_a_landing() -> None:
@@ -134,9 +134,9 @@ def test_a_vehicle_that_its_pilot_flies_refuses_all_but_resume(verb: str) -> Non
     flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, FlightMode.MANUAL
     flight.run(0.5)
     assert "has taken over and flies it in MANUAL; take it back with: resume" in flight.ask(verb)
-    assert (flight.phase, flight.state_machine.outcome) == (Phase.TRACK, TAKEN_OVER)
+    assert (flight.phase, flight.mission.outcome) == (Phase.TRACK, TAKEN_OVER)
     assert flight.ask("resume") == ""
-    assert not flight.state_machine.pilot_override
+    assert not flight.mission.pilot_override
 
 
 def test_a_climb_that_a_pilot_flies_is_not_held() -> None:
@@ -182,7 +182,7 @@ def test_a_hold_before_the_climb_keeps_it_on_the_ground() -> None:
     assert Verb.TAKEOFF not in flight.run(LONG_S)
     flight.ask("resume")
     assert flight.run(0.1) == [Verb.TAKEOFF]
-    assert not flight.state_machine._climb.cut_short
+    assert not flight.mission.climb.cut_short
     guided = Flight()
     guided.arm_in = FlightMode.EXTERNAL
     guided.until(Phase.TAKEOFF)
@@ -216,7 +216,7 @@ def test_a_hold_while_waiting_for_the_others_holds_when_the_mission_begins() -> 
     flight.until(Phase.TRACK)
     flight.run(3.0)
     np.testing.assert_allclose(place(flight), START, atol=1e-9)
-    assert flight.state_machine.held
+    assert flight.mission.held
 
 
 @pytest.mark.parametrize("verb", ["land", "rtl"])
@@ -226,7 +226,7 @@ def test_a_stop_ends_a_hold_in_every_phase(phase: Phase, verb: str) -> None:
     flight.ask("hold")
     flight.run(1.0)
     assert flight.ask(verb) == ""
-    assert not flight.state_machine.held
+    assert not flight.mission.held
     assert flight.phase >= Phase.GOTO_LAND
 
 
@@ -246,7 +246,7 @@ def test_what_must_not_wait_ends_a_hold_on_the_way_to_land() -> None:
     flight.ask("hold")
     flight.cut_off = "cut off from agent-1"
     flight.run(0.2)
-    assert not flight.state_machine.held
+    assert not flight.mission.held
 
 
 def test_a_stop_of_what_has_landed_is_done_already_but_not_of_what_was_handed_back_in_the_air() -> None:
@@ -273,7 +273,7 @@ def test_the_time_of_a_hold_does_not_count_as_time_to_the_start() -> None:
 def test_a_pause_on_the_way_to_a_point_goes_on_to_it_and_hold_stops_it(phase: Phase) -> None:
     flight = controlled(phase)
     assert flight.ask(GOTO, **POINT, speed_m_s=1.0, yaw_deg=90.0) == ""
-    assert flight.state_machine.yaw_rad == pytest.approx(np.pi / 2)
+    assert flight.mission.yaw_rad == pytest.approx(np.pi / 2)
     flight.unresponsive_peer = True
     flight.run(0.5)
     assert np.linalg.norm(place(flight) - flight.pos) < 1e-9
@@ -288,14 +288,14 @@ def test_a_pause_on_the_way_to_a_point_goes_on_to_it_and_hold_stops_it(phase: Ph
     flight.unresponsive_peer = False
     flight.run(0.5)
     assert np.linalg.norm(place(flight) - flight.pos) < 1e-9
-    assert flight.state_machine.yaw_rad is None
+    assert flight.mission.yaw_rad is None
 
 
 def test_the_speed_of_a_goto_is_its_peak_speed() -> None:
     flight = controlled(Phase.TRACK)
     for speed_m_s in (0.5, 1.5):
         flight.ask(GOTO, north_m=float(flight.pos[0]) + 30.0, east_m=0.0, down_m=-4.0, speed_m_s=speed_m_s)
-        _, vel = flight.state_machine.reference(flight.utc_us, flight.now_us, np.linspace(0.0, 150.0, 1000))
+        _, vel = flight.mission.reference(flight.utc_us, flight.now_us, np.linspace(0.0, 150.0, 1000))
         assert np.linalg.norm(vel, axis=1).max() == pytest.approx(speed_m_s, rel=0.02)
 
 
@@ -305,7 +305,7 @@ def test_a_stop_ends_a_goto_and_none_begins_after_one(verb: str) -> None:
     flight.pos = START + np.array([2.0, 0.0, 0.0])
     flight.ask(GOTO, **POINT, yaw_deg=10.0)
     assert flight.ask(verb) == ""
-    assert flight.state_machine.yaw_rad is None
+    assert flight.mission.yaw_rad is None
     assert "GOTO_LAND" in flight.ask(GOTO, **POINT)
 
 
@@ -314,7 +314,7 @@ def test_a_point_in_the_ground_or_a_way_out_of_the_fence_is_refused() -> None:
     assert "too low: -0.50 at most" in flight.ask(GOTO, **POINT | {"down_m": -0.4})
     assert flight.ask(GOTO, **POINT | {"down_m": -0.6}) == ""
     fenced = controlled(Phase.TRACK)
-    fenced.state_machine._contains = lambda at_ne_m: not 4.0 < at_ne_m[0] < 6.0  # the straight way north leaves it
+    fenced.mission.contains = lambda at_ne_m: not 4.0 < at_ne_m[0] < 6.0  # the straight way north leaves it
     assert fenced.ask(GOTO, **POINT | {"north_m": 3.9}) == ""
     held_at = place(fenced)
     for north_m in (5.0, 9.0):
@@ -326,7 +326,7 @@ def test_a_point_outside_of_the_flight_volume_is_refused_with_its_reason() -> No
     flight = controlled(Phase.TRACK)
     held_at = place(flight)
     corners = ((-5.0, -5.0), (5.0, -5.0), (5.0, 5.0), (-5.0, 5.0))
-    flight.state_machine._volume = FlightVolume(VolumeParams(corners_ne_m=corners, floor_z_m=-1.0, ceiling_z_m=-6.0))
+    flight.mission.volume = FlightVolume(VolumeParams(corners_ne_m=corners, floor_z_m=-1.0, ceiling_z_m=-6.0))
     for changed, face in (({"north_m": 4.9}, "side"), ({"down_m": -8.0}, "ceiling"), ({"down_m": -1.2}, "floor")):
         refusal = flight.ask(GOTO, **POINT | changed)
         assert "outside of the flight volume less volume.margin_m = 0.3" in refusal
@@ -337,7 +337,7 @@ def test_a_point_outside_of_the_flight_volume_is_refused_with_its_reason() -> No
 
 def test_where_the_ground_is_unknown_nothing_lower_than_the_start_is_flown_to() -> None:
     flight = controlled(Phase.TRACK)
-    flight.state_machine._airborne = True
+    flight.mission.airborne = True
     assert "too low: -3.00 at most" in flight.ask(GOTO, **POINT | {"down_m": -2.9})
 
 
@@ -363,13 +363,13 @@ def test_what_is_no_order_is_named() -> None:
 
 def test_it_is_known_when_the_mission_or_what_precedes_it_ends_unless_it_is_held() -> None:
     flight = controlled(Phase.TRACK)
-    machine = flight.state_machine
-    left_s = machine.ends_in_s(flight.now_us, flight.utc_us)
-    assert left_s == pytest.approx(machine._duration_us * 1e-6 - machine.mission_t_s(flight.utc_us))
+    mission = flight.mission
+    left_s = mission.ends_in_s(flight.now_us, flight.utc_us)
+    assert left_s == pytest.approx(mission.duration_us * 1e-6 - mission.mission_t_s(flight.utc_us))
     flight.run(1.0)
-    assert machine.ends_in_s(flight.now_us, flight.utc_us) == pytest.approx(left_s - 1.0)
+    assert mission.ends_in_s(flight.now_us, flight.utc_us) == pytest.approx(left_s - 1.0)
     flight.ask("hold")
-    assert math.isnan(machine.ends_in_s(flight.now_us, flight.utc_us))
+    assert math.isnan(mission.ends_in_s(flight.now_us, flight.utc_us))
     flight = controlled(Phase.GOTO_START)
-    patience_s = flight.state_machine._params.start_timeout_s
-    assert 0.0 < flight.state_machine.ends_in_s(flight.now_us, flight.utc_us) < patience_s
+    patience_s = flight.mission.params.start_timeout_s
+    assert 0.0 < flight.mission.ends_in_s(flight.now_us, flight.utc_us) < patience_s

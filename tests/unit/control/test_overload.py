@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from swarmctl.control.phases.overload import Level, Overload, OverloadParams, SetpointStops
+from swarmctl.control.failsafe.overload import Level, Overload, OverloadParams, SetpointStops
 
 PERIOD_US = 20_000
 

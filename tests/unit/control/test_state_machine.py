@@ -25,7 +25,7 @@ def test_a_whole_flight_requests_each_command_once_and_in_order() -> None:
             phases.append(flight.phase)
     assert asked == [Verb.ARM, Verb.TAKEOFF, Verb.EXTERNAL, Verb.LAND]
     assert phases == list(Phase)[1:]
-    assert (flight.state_machine.finished, flight.state_machine.outcome) == (True, "completed")
+    assert (flight.mission.finished, flight.mission.outcome) == (True, "completed")
 
 
 def test_without_a_vehicle_or_link_setup_nothing_is_requested() -> None:
@@ -48,7 +48,7 @@ def test_a_refusal_to_arm_ends_the_mission_with_its_reason(phase: Phase) -> None
     assert flight.phase is phase
     flight.prepared, flight.refusal = True, "COM_OBL_RC_ACT can't be read"
     assert flight.run(5.0) == []
-    assert (flight.at, flight.state_machine.outcome) == ("DONE", "COM_OBL_RC_ACT can't be read")
+    assert (flight.at, flight.mission.outcome) == ("DONE", "COM_OBL_RC_ACT can't be read")
     flight.refusal = ""
     assert flight.run(5.0) == []
 
@@ -57,7 +57,7 @@ def test_when_a_peer_gives_up_on_the_ground_no_agent_takes_off() -> None:
     flight = Flight()
     flight.peer(Phase.DONE)
     assert flight.run(5.0) == []
-    assert (flight.at, flight.state_machine.outcome) == ("DONE", "a peer gave up before take-off")
+    assert (flight.at, flight.mission.outcome) == ("DONE", "a peer gave up before take-off")
 
 
 @pytest.mark.parametrize("phase", [Phase.TRACK, Phase.GOTO_LAND, Phase.LAND])
@@ -68,7 +68,7 @@ def test_who_comes_after_the_mission_has_begun_stays_on_the_ground(phase: Phase)
     assert flight.at == "DONE"
     began = phase is Phase.TRACK
     outcome = "the mission has begun without it" if began else "a peer gave up before take-off"
-    assert flight.state_machine.outcome == outcome
+    assert flight.mission.outcome == outcome
 
 
 def test_who_waits_says_for_whom() -> None:
@@ -76,18 +76,18 @@ def test_who_waits_says_for_whom() -> None:
     flight.peers = {1: PeerInputs(Phase.STANDBY, 0, True), 2: PeerInputs(Phase.CONNECT, 0, True)}
     flight.run(1.0)
     assert flight.at == "STANDBY"
-    assert flight.state_machine.waits_for == "agent-2, agent-3, agent-4, agent-5 and 1 more to stand by"
+    assert flight.mission.waits_for == "agent-2, agent-3, agent-4, agent-5 and 1 more to stand by"
 
 
 def test_who_has_never_come_and_is_excluded_is_not_waited_for() -> None:
     flight = Flight(peers=3)
     del flight.peers[3]
     flight.run(1.0)
-    assert (flight.at, flight.state_machine.waits_for) == ("STANDBY", "agent-3 to stand by")
+    assert (flight.at, flight.mission.waits_for) == ("STANDBY", "agent-3 to stand by")
     flight.excused = frozenset({3})
     flight.until(Phase.READY)
     flight.run(1.0)
-    assert flight.state_machine.waits_for == "agent-1, agent-2 to reach the start"
+    assert flight.mission.waits_for == "agent-1, agent-2 to reach the start"
     flight.peers |= dict.fromkeys((1, 2), PeerInputs(Phase.READY, flight.utc_us, True))
     flight.run(2.0)
     assert flight.at == "TRACK"
@@ -106,12 +106,12 @@ def test_arducopter_is_guided_before_it_is_armed_and_takes_off_in_that_mode() ->
     assert flight.run(0.3) == [Verb.TAKEOFF]
     flight.landed, flight.vel = IN_AIR, np.array([0.0, 0.0, -1.0])
     assert flight.run(1.0) == []
-    assert (flight.at, flight.state_machine.had_control) == ("TAKEOFF", False), "it climbs by itself"
+    assert (flight.at, flight.mission.had_control) == ("TAKEOFF", False), "it climbs by itself"
     flight.pos, flight.vel = START.copy(), np.zeros(3)
     flight.run(0.8)
-    assert not flight.state_machine.had_control, "its hover thrust is being learned"
+    assert not flight.mission.had_control, "its hover thrust is being learned"
     flight.run(0.5)
-    assert flight.state_machine.had_control
+    assert flight.mission.had_control
 
 
 @pytest.mark.parametrize("missing", ["armable", "answers", "peer", "peer alive", "peer vehicle"])
@@ -181,8 +181,8 @@ def test_ready_means_at_the_start_and_at_rest() -> None:
     flight = Flight().until(Phase.GOTO_START)
     flight.flight_mode, flight.pos = FlightMode.EXTERNAL, START + np.array([0.5, 0.0, 0.0])
     flight.run(1.0)
-    assert (flight.phase, flight.state_machine.had_control) == (Phase.GOTO_START, True)
-    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([-10.0, 60.0]))
+    assert (flight.phase, flight.mission.had_control) == (Phase.GOTO_START, True)
+    pos, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.array([-10.0, 60.0]))
     np.testing.assert_allclose(pos, [START + np.array([0.5, 0.0, 0.0]), START], atol=1e-9)
     flight.pos, flight.vel = START.copy(), np.array([0.5, 0.0, 0.0])
     flight.run(0.5)
@@ -190,7 +190,7 @@ def test_ready_means_at_the_start_and_at_rest() -> None:
     flight.vel = np.zeros(3)
     ready_us = flight.utc_us
     flight.run(0.1)
-    assert (flight.phase, flight.state_machine.ready_utc_us) == (Phase.READY, ready_us)
+    assert (flight.phase, flight.mission.ready_utc_us) == (Phase.READY, ready_us)
 
 
 # -- the common beginning ---------------------------------------------------------------------------------------------
@@ -203,26 +203,26 @@ def test_all_wait_for_the_last_agent_and_begin_a_second_later() -> None:
     late_us = flight.utc_us - 50_000
     flight.peer(Phase.READY, late_us)
     flight.run(0.9)
-    assert (flight.phase, flight.state_machine.begin_utc_us) == (Phase.READY, late_us + SECOND)
+    assert (flight.phase, flight.mission.begin_utc_us) == (Phase.READY, late_us + SECOND)
     flight.run(0.2)
     assert flight.at == "TRACK"
 
 
 def test_all_agents_compute_the_same_beginning() -> None:
     one, other = ready(), ready()
-    one.state_machine.ready_utc_us, other.state_machine.ready_utc_us = UTC0_US + 7, UTC0_US + 99
+    one.mission.ready_utc_us, other.mission.ready_utc_us = UTC0_US + 7, UTC0_US + 99
     one.peer(Phase.READY, UTC0_US + 99)
     other.peer(Phase.TRACK, UTC0_US + 7)
     one.run(0.1)
     other.run(0.1)
-    assert one.state_machine.begin_utc_us == other.state_machine.begin_utc_us == UTC0_US + 99 + SECOND
+    assert one.mission.begin_utc_us == other.mission.begin_utc_us == UTC0_US + 99 + SECOND
 
 
 def test_one_of_two_peers_is_not_enough() -> None:
     flight = ready(2)
     flight.peer(Phase.READY, UTC0_US + 5)
     flight.run(20.0)
-    assert (flight.phase, flight.state_machine.begin_utc_us) == (Phase.READY, None)
+    assert (flight.phase, flight.mission.begin_utc_us) == (Phase.READY, None)
 
 
 def test_a_peer_lost_before_the_beginning_sends_all_home() -> None:
@@ -230,16 +230,16 @@ def test_a_peer_lost_before_the_beginning_sends_all_home() -> None:
     flight.peer(Phase.READY, 0, alive=False)
     flight.run(0.1)
     assert flight.at == "GOTO_LAND"
-    assert "was lost before the mission began" in flight.state_machine.outcome
+    assert "was lost before the mission began" in flight.mission.outcome
 
 
 def test_the_reference_runs_on_the_common_clock_and_only_while_tracking() -> None:
     flight = ready()
-    assert math.isnan(flight.state_machine.mission_t_s(flight.utc_us))
+    assert math.isnan(flight.mission.mission_t_s(flight.utc_us))
     flight.until(Phase.TRACK)
-    begin_us = flight.state_machine.begin_utc_us
+    begin_us = flight.mission.begin_utc_us
     assert begin_us is not None
-    pos, vel = flight.state_machine.reference(begin_us + 2 * SECOND, 0, np.array([0.0, 1.0]))
+    pos, vel = flight.mission.reference(begin_us + 2 * SECOND, 0, np.array([0.0, 1.0]))
     np.testing.assert_allclose(pos, [[5.0, 3.4, -2.2], [6.5, 4.1, -2.3]])
     np.testing.assert_allclose(vel, [[1.5, 0.7, -0.1]] * 2)
-    assert flight.state_machine.mission_t_s(begin_us + 2 * SECOND) == 2.0
+    assert flight.mission.mission_t_s(begin_us + 2 * SECOND) == 2.0

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarmctl.control.phases.state_machine import OPERATOR_STOP, REBOOTED
+from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
+from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.state_machine_flight import (
@@ -27,15 +28,15 @@ def test_after_a_pilot_override_nothing_is_requested(phase: Phase) -> None:
     flight = controlled(phase)
     flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, FlightMode.MANUAL
     assert flight.run(0.1) == []
-    assert not flight.state_machine.had_control
+    assert not flight.mission.had_control
     flight.failsafe_mode = Mode.PRIMING  # without control the failsafe sees no override any more
     assert flight.run(120.0) == []  # past every timeout
     flight.flight_mode = FlightMode.EXTERNAL  # not even when the pilot tries our mode
     assert flight.run(5.0) == []
-    assert not flight.state_machine.had_control
+    assert not flight.mission.had_control
     flight.armed, flight.landed = False, ON_GROUND
     assert flight.run(5.0) == []
-    assert (flight.phase, flight.state_machine.outcome) == (Phase.DONE, "pilot or autopilot took over")
+    assert (flight.phase, flight.mission.outcome) == (Phase.DONE, "pilot or autopilot took over")
 
 
 STOPPED = "overload: setpoints stopped 0.5 s (26 deadline misses, 2078 since the start)"
@@ -48,13 +49,13 @@ def test_a_takeover_after_setpoints_stopped_is_called_overload(stopped: str, con
     flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, FlightMode.HOLD
     flight.run(0.1)
     told = f"{STOPPED}: the autopilot took over" if stopped else "pilot or autopilot took over"
-    assert flight.state_machine.outcome == told
-    assert flight.state_machine.control_mode(Mode.PILOT_OVERRIDE) == control
+    assert flight.mission.outcome == told
+    assert flight.mission.control_mode(Mode.PILOT_OVERRIDE) == control
     flight.setpoints_stopped, flight.failsafe_mode = "", Mode.PRIMING
     flight.run(10.0)
-    assert flight.state_machine.outcome == told, "for as long as it lasts"
+    assert flight.mission.outcome == told, "for as long as it lasts"
     flight.ask("resume")
-    assert flight.state_machine.outcome == ""
+    assert flight.mission.outcome == ""
 
 
 @pytest.mark.parametrize("flown", [FlightMode.HOLD, FlightMode.MANUAL], ids=["by the autopilot", "by the pilot"])
@@ -67,7 +68,7 @@ def test_only_the_operator_resumes_and_then_offboard_is_requested(flown: FlightM
     assert Verb.EXTERNAL in flight.run(1.5)
     flight.flight_mode = FlightMode.EXTERNAL
     flight.run(0.1)
-    assert flight.state_machine.had_control
+    assert flight.mission.had_control
 
 
 @pytest.mark.parametrize("verb", ["hold", "land", "rtl"])
@@ -112,7 +113,7 @@ def test_hold_stops_where_it_is_and_resume_goes_on_with_the_mission() -> None:
     flight = controlled(Phase.TRACK)
     flight.pos, flight.vel = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0])
     flight.ask("hold")
-    pos, vel = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    pos, vel = flight.mission.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
     np.testing.assert_allclose(pos[0], [4.0, 2.0, -2.0])
     np.testing.assert_allclose(vel, np.array([[1.2, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     assert pos[1, 0] == pytest.approx(4.0 + 1.2)  # v T / 2 with T = 2 v / a
@@ -120,7 +121,7 @@ def test_hold_stops_where_it_is_and_resume_goes_on_with_the_mission() -> None:
     assert flight.at == "TRACK"  # the mission does not end while held
     flight.ask("resume")
     flight.run(0.1)
-    assert (flight.phase, flight.state_machine.outcome) == (Phase.GOTO_LAND, "completed")
+    assert (flight.phase, flight.mission.outcome) == (Phase.GOTO_LAND, "completed")
 
 
 @pytest.mark.parametrize(
@@ -131,8 +132,8 @@ def test_land_is_here_and_rtl_is_at_the_start(phase: Phase, verb: str, target: n
     flight = controlled(phase)
     flight.pos = np.array([4.0, 2.0, -2.0])
     flight.ask(verb)
-    assert (flight.phase, flight.state_machine.outcome) == (Phase.GOTO_LAND, OPERATOR_STOP)
-    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    assert (flight.phase, flight.mission.outcome) == (Phase.GOTO_LAND, OPERATOR_STOP)
+    pos, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
     np.testing.assert_allclose(pos, np.array([np.array([4.0, 2.0, -2.0]), target]), atol=1e-9)
     flight.pos = target.copy()
     if verb == "land":  # it may still be pushed aside: first it has to have come to rest
@@ -167,9 +168,9 @@ def test_during_the_landing_verbs_change_nothing(phase: Phase, verb: str) -> Non
     flight = controlled(Phase.GOTO_LAND)
     flight.pos = START.copy()
     flight.until(phase)
-    before = flight.phase, flight.state_machine.outcome
+    before = flight.phase, flight.mission.outcome
     flight.ask(verb)
-    assert (flight.phase, flight.state_machine.outcome) == before
+    assert (flight.phase, flight.mission.outcome) == before
 
 
 # -- timeouts ---------------------------------------------------------------------------------------------------------
@@ -182,15 +183,15 @@ def test_a_start_that_takes_too_long_is_given_up_on_the_ground() -> None:
     assert flight.at == "STANDBY"
     flight.run(0.5)
     assert flight.at == "DONE"
-    assert "20 s" in flight.state_machine.outcome
-    assert "STANDBY" in flight.state_machine.outcome
+    assert "20 s" in flight.mission.outcome
+    assert "STANDBY" in flight.mission.outcome
 
 
 def test_a_start_that_takes_too_long_in_the_air_lands() -> None:
     flight = ready()
     assert flight.run(120.0).count(Verb.LAND) > 0
     assert flight.at == "LAND"
-    assert "READY" in flight.state_machine.outcome
+    assert "READY" in flight.mission.outcome
 
 
 def test_a_landing_place_that_cannot_be_reached_is_given_up() -> None:
@@ -207,7 +208,7 @@ def test_no_plan_for_too_long_lands(phase: Phase) -> None:
     flight.failsafe_mode = Mode.LAND
     assert Verb.LAND in flight.run(0.3)
     assert flight.at == "LAND"
-    assert flight.state_machine.outcome
+    assert flight.mission.outcome
 
 
 # -- found in the air -------------------------------------------------------------------------------------------------
@@ -235,9 +236,9 @@ def test_a_vehicle_found_in_the_air_is_handed_back_in_the_air(landed_at_first: L
             flight.flight_mode = FlightMode.HOLD
     assert not {Verb.ARM, Verb.TAKEOFF, Verb.LAND, Verb.DISARM} & set(asked)
     assert asked[-1] is Verb.HOLD
-    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], flight.pos, atol=1e-9)  # where the mission ends, not where it began
-    assert (flight.phase, flight.state_machine.outcome) == (Phase.DONE, "completed")
+    assert (flight.phase, flight.mission.outcome) == (Phase.DONE, "completed")
     assert flight.armed
 
 
@@ -248,7 +249,7 @@ def test_bus_loss_brings_it_to_rest_and_recovery_resumes_the_mission() -> None:
     flight = controlled(Phase.TRACK)
     flight.pos, flight.vel, flight.unresponsive_peer = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0]), True
     flight.run(0.1)
-    pos, vel = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, vel = flight.mission.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], [5.2, 2.0, -2.0])
     assert not vel.any()
     flight.run(60.0)
@@ -267,7 +268,7 @@ def test_a_landing_in_place_stays_in_place_after_a_bus_loss() -> None:
     flight.run(1.0)
     flight.unresponsive_peer = False
     flight.run(0.1)
-    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], here, atol=1e-9)
 
 
@@ -279,7 +280,7 @@ def test_a_land_command_during_bus_loss_lands_in_place() -> None:
     flight.ask("land")
     flight.unresponsive_peer = False
     flight.run(0.1)
-    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], here, atol=1e-9)
 
 
@@ -310,7 +311,7 @@ def test_negative_control_taken_during_bus_loss_stays_in_place() -> None:
     flight.run(0.5)
     flight.flight_mode = FlightMode.EXTERNAL
     flight.run(0.2)
-    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], START + np.array([3.0, 0.0, 0.0]), atol=1e-9)
 
 
@@ -322,13 +323,13 @@ def test_after_a_reboot_of_the_autopilot_nothing_is_requested(phase: Phase) -> N
     flight = controlled(phase) if phase in CONTROLLED_PHASES else Flight().until(phase)
     flight.boots, flight.seen = 1, False  # no position yet
     flight.run(0.2)
-    assert flight.state_machine.outcome == REBOOTED
+    assert flight.mission.outcome == REBOOTED
     flight.seen, flight.armed, flight.flight_mode = True, False, FlightMode.HOLD
     flight.landed = IN_AIR
     assert flight.run(5.0) == []
     flight.landed = ON_GROUND
     assert flight.run(5.0) == []
-    assert (flight.at, flight.state_machine.outcome) == ("DONE", REBOOTED)
+    assert (flight.at, flight.mission.outcome) == ("DONE", REBOOTED)
 
 
 def test_a_reboot_before_anything_was_armed_costs_nothing() -> None:
@@ -353,7 +354,7 @@ def test_no_setpoints_are_sent_to_a_vehicle_in_failsafe_or_with_a_pilot(mode: Fl
     flight.flight_mode, flight.failsafe = mode, failsafe
     assert flight.run(5.0) == []
     assert flight.phase < Phase.GOTO_START, "in which setpoints flow"
-    assert flight.state_machine.pilot_override
+    assert flight.mission.pilot_override
     flight.ask("resume")
     assert Verb.EXTERNAL in flight.run(1.0)
 
@@ -369,7 +370,7 @@ def test_a_landing_in_place_moves_to_a_free_place_first() -> None:
     flight.failsafe_mode = Mode.TRACKING
     flight.ask("land")
     assert Verb.LAND not in flight.run(6.0)
-    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     assert np.linalg.norm((pos[0] - CLOSE)[:2]) == pytest.approx(0.9 + 0.2 + 0.1)
     assert pos[0][2] == START[2]
     flight.pos = pos[0]
@@ -403,9 +404,9 @@ def test_a_start_given_up_at_speed_brakes_before_the_autopilot_lands_it() -> Non
     while flight.phase is Phase.GOTO_START:
         flight.step()
     assert flight.at == "GOTO_LAND"
-    _, vel = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    _, vel = flight.mission.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
     np.testing.assert_allclose(vel[1], 0.0)
-    assert "not tracking" in flight.state_machine.outcome
+    assert "not tracking" in flight.mission.outcome
 
 
 def test_only_without_a_plan_it_is_landed_at_once() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarmctl.control.phases.state_machine import OPERATOR_STOP
+from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.types import FlightMode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, ON_GROUND, START, Flight
 
@@ -34,7 +34,7 @@ def test_a_stop_between_the_acknowledgement_of_arming_and_its_heartbeat_disarms(
     assert flight.at == "LAND"
     flight.armed, flight.beat_us = False, flight.now_us
     flight.run(0.2)
-    assert (flight.at, flight.state_machine.outcome) == ("DONE", OPERATOR_STOP)
+    assert (flight.at, flight.mission.outcome) == ("DONE", OPERATOR_STOP)
 
 
 def test_a_refusal_after_an_arm_request_disarms_before_giving_up() -> None:
@@ -44,7 +44,7 @@ def test_a_refusal_after_an_arm_request_disarms_before_giving_up() -> None:
     assert flight.at == "LAND"
     flight.beat_us = flight.now_us
     flight.run(0.2)
-    assert (flight.at, flight.state_machine.outcome) == ("DONE", "COM_OBL_RC_ACT = 7")
+    assert (flight.at, flight.mission.outcome) == ("DONE", "COM_OBL_RC_ACT = 7")
 
 
 @pytest.mark.parametrize("verb", ["land", "rtl"])
@@ -56,7 +56,7 @@ def test_a_stop_before_the_first_vehicle_state_is_kept_until_there_is_one(verb: 
     assert flight.at == "CONNECT"
     flight.seen = True
     assert Verb.ARM not in flight.run(5.0)
-    assert (flight.at, flight.state_machine.outcome) == ("DONE", OPERATOR_STOP)
+    assert (flight.at, flight.mission.outcome) == ("DONE", OPERATOR_STOP)
 
 
 def test_a_stop_before_the_first_state_lands_a_vehicle_that_hovers_armed() -> None:
@@ -104,16 +104,16 @@ def test_land_on_the_way_home_lands_here_and_repeating_it_does_not_begin_again()
     flight.pos = START + np.array([4.0, 0.0, 0.0])
     flight.ask("rtl")
     flight.run(0.5)
-    target = flight.state_machine._trajectories.destination_ned_m.copy()
+    target = flight.mission.trajectories.destination_ned_m.copy()
     flight.ask("land")
     flight.run(0.1)
-    here = flight.state_machine._trajectories.destination_ned_m.copy()
+    here = flight.mission.trajectories.destination_ned_m.copy()
     assert (target == START).all()
     assert abs(here[0] - flight.pos[0]) < 0.5
-    began_us = flight.state_machine._entered_us
+    began_us = flight.mission.entered_us
     flight.ask("land")
     flight.run(0.1)
-    assert flight.state_machine._entered_us == began_us
+    assert flight.mission.entered_us == began_us
 
 
 def test_temporary_causes_are_waited_for_and_named_at_the_timeout() -> None:
@@ -127,14 +127,14 @@ def test_temporary_causes_are_waited_for_and_named_at_the_timeout() -> None:
     late.unsettled = "the estimator's accuracy to settle (now 14.10 m)"
     assert late.run(20.5) == []
     assert late.at == "DONE"
-    assert "14.10 m" in late.state_machine.outcome
+    assert "14.10 m" in late.mission.outcome
 
 
 def test_a_vehicle_left_in_offboard_is_put_on_hold_so_that_it_can_be_armed() -> None:
     flight = Flight()
     flight.flight_mode, flight.armable = FlightMode.EXTERNAL, False
     assert flight.run(3.0).count(Verb.HOLD) == 3
-    assert "EXTERNAL" in flight.state_machine.waits_for
+    assert "EXTERNAL" in flight.mission.waits_for
     flight.flight_mode, flight.armable = FlightMode.HOLD, True
     assert Verb.ARM in flight.run(0.3)
     armed = Flight()
@@ -148,7 +148,7 @@ def test_an_agent_waiting_for_the_beginning_goes_home_when_a_peer_gives_up(phase
     flight.peer(phase)
     flight.run(0.3)
     assert flight.phase in (Phase.GOTO_LAND, Phase.LAND), "it stands on its landing place already"
-    assert "gave up" in flight.state_machine.outcome
+    assert "gave up" in flight.mission.outcome
 
 
 @pytest.mark.parametrize("phase", [Phase.GOTO_START, Phase.READY, Phase.TRACK])
@@ -157,4 +157,4 @@ def test_an_agent_that_is_cut_off_from_its_peers_lands_where_it_is(phase: Phase)
     flight.cut_off = "cut off from agent-1"
     flight.run(0.2)
     assert flight.phase >= Phase.GOTO_LAND
-    assert flight.state_machine.outcome == "cut off from agent-1"
+    assert flight.mission.outcome == "cut off from agent-1"

@@ -12,7 +12,7 @@ from swarmctl.control.controllers.discovery import ControllerParams, make_contro
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.controllers.own import OwnController
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc import swarm_mpc
+from swarmctl.control.mpc import judgement, swarm_mpc
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.control.reference.landing_places import landing_place_ned_m
@@ -162,7 +162,7 @@ def test_the_certificate_refuses_what_rows_have_missed(monkeypatch: pytest.Monke
     track, statuses = flown(controller(), OUTSIDE[0], seconds=3.0)
     refused = statuses.index(PlanStatus.NOT_CERTIFIED)
     assert float(VOLUME.beyond_m(track[refused])) < -KEPT_M, "while it is well inside"
-    monkeypatch.setattr(swarm_mpc, "volume_margin_m", lambda *_: np.inf)
+    monkeypatch.setattr(judgement, "volume_margin_m", lambda *_: np.inf)
     assert PlanStatus.NOT_CERTIFIED not in flown(controller(), OUTSIDE[0], seconds=3.0)[1]
 
 

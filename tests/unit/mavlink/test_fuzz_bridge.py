@@ -14,9 +14,9 @@ from pymavlink.dialects.v20 import development as mav
 from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import GeoOrigin
-from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.transport import PipeTransport, pipe_pair
+from swarmctl.mavlink.vehicle.autopilot import Autopilot
 from swarmctl.simulator_config import SimulatorConfig
 from tests.benches.hostile import POISON, Hostile, frame_of
 
@@ -72,7 +72,10 @@ class Listener:
         return f"{self.autopilot.poll(self.clock.now_us())} {beliefs(self.autopilot)}"
 
 
-NOT_BELIEFS = frozenset({"_transport", "_codec", "_on_frame", "_slow", "_handlers"})
+# connections, handlers, and the counter of what was refused
+NOT_BELIEFS = frozenset(
+    {"_transport", "_codec", "_on_frame", "_slow", "_handlers", "_send_frame", "_on_reboot", "_refused"}
+)
 
 
 def beliefs(thing: Any) -> Any:

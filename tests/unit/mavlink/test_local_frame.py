@@ -9,7 +9,7 @@ import pymap3d
 import pytest
 
 from swarmctl.core.types import MAX_MARGIN_M, Array, GeoOrigin
-from swarmctl.mavlink.local_frame import LocalFrame
+from swarmctl.mavlink.vehicle.local_frame import LocalFrame
 
 SHARED = GeoOrigin(47.397742, 8.545594, 489.4)
 STEP_US = 20_000

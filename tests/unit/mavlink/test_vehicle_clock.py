@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from swarmctl.mavlink.vehicle_clock import VehicleClock
+from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 
 BOOTED_US = 5_000_000  # the vehicle's clock when ours is 0
 TICK_US = 10_000

@@ -11,11 +11,11 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import Command, FlightMode, GeoOrigin, Landed, Verb
-from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.mavlink.vehicle.autopilot import Autopilot
 from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
 HOME = GeoOrigin(47.397742, 8.545594, 489.4)

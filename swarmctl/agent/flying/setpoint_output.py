@@ -1,0 +1,85 @@
+"""From the plan that is flown in a tick to the one setpoint that leaves in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from swarmctl.agent.flying.safety_filter import SafetyFilter
+from swarmctl.agent.planning.reference_selector import ReferenceSelector
+from swarmctl.agent.ports import Ports
+from swarmctl.agent.sensing.own_state import OwnState
+from swarmctl.agent.setup import AgentSetup
+from swarmctl.agent.watches.alerts import Alerts
+from swarmctl.control.mpc.problem import Start
+from swarmctl.control.reference.heading import Heading
+from swarmctl.control.setpoint import setpoint_of
+from swarmctl.core.trajectory import Trajectory
+from swarmctl.core.types import AttitudeSetpoint, Plan
+
+
+class SetpointOutput:
+    """Sends the setpoints of one agent.
+
+    Args:
+        setup: model of the vehicle, and the heading to begin with.
+        ports: the vehicle; receives the event `setpoint_refused`.
+        safety_filter: sees every command before it is sent.
+        own_state: is told what was sent.
+        references: know the heading to turn to.
+        alerts: are told of setpoints that are refused.
+    """
+
+    def __init__(
+        self,
+        setup: AgentSetup,
+        ports: Ports,
+        safety_filter: SafetyFilter,
+        own_state: OwnState,
+        references: ReferenceSelector,
+        *,
+        alerts: Alerts,
+    ) -> None:
+        self._model, self._heading = setup.vehicle_model, Heading(setup.mission.yaw_rad)
+        self._ports, self._safety_filter, self._own_state = ports, safety_filter, own_state
+        self._references, self._alerts = references, alerts
+
+    def send(
+        self,
+        now_us: int,
+        flown: Plan | None,
+        start: Start | None,
+        *,
+        flies: bool,
+        committed_peers: Mapping[int, Sequence[Trajectory]],
+    ) -> AttitudeSetpoint | None:
+        """Send the command of a plan that acts when the setpoint arrives; returns what has been sent.
+
+        Args:
+            now_us: monotonic time.
+            flown: plan of this tick; None: nothing is sent.
+            start: predicted state at which the setpoint acts; None: nothing is sent.
+            flies: the agent flies the vehicle in this tick's mode.
+            committed_peers: trajectories that peers have committed to.
+        """
+        if flown is None or start is None:
+            self._safety_filter.skip(now_us)
+            return None
+        act_us, estimate = now_us + self._own_state.delay_us, self._own_state.estimate
+        step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual_control) - 1)
+        virtual_control = self._safety_filter.keep_apart(
+            now_us,
+            self._ports.utc_of_us(act_us),
+            flown.virtual_control[step],
+            start,
+            estimate=estimate,
+            flies=flies,
+            committed_peers=committed_peers,
+        )
+        yaw_rad = self._heading.at(now_us, self._references.heading_rad(self._ports.clock.utc_us()))
+        setpoint = setpoint_of(virtual_control, yaw_rad, estimate.hover_thrust_01, now_us, params=self._model)
+        if refused := self._ports.autopilot.send(setpoint, self._ports.clock.now_us()):
+            self._alerts.put("setpoint", f"setpoint refused: {refused}", now_us)
+            self._ports.note("setpoint_refused", reason=refused)
+            return None
+        self._own_state.sent(now_us, virtual_control, setpoint.thrust_01)
+        return setpoint

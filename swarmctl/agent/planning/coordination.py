@@ -1,0 +1,337 @@
+"""An agent's part in guaranteed separation: receives peers' messages, runs `control.commit`, publishes its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from dataclasses import asdict, replace
+
+import numpy as np
+
+from swarmctl.agent.sensing.world_model import WorldModel
+from swarmctl.bus import topics
+from swarmctl.bus.commitment_messages import PeerTrajectories, encode_trajectory_message
+from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.bus.relay import missed_by_peers
+from swarmctl.control.collision.encounters import Encounters
+from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
+from swarmctl.control.commit.membership import Membership
+from swarmctl.control.commit.protocol import CommitCounts, Commitments, acknowledgements
+from swarmctl.control.commit.trajectory_planner import (
+    CommitParams,
+    DesiredReference,
+    Situation,
+    TrajectoryPlanner,
+    slowed,
+)
+from swarmctl.control.commit.tube import Grip, Tube
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.core.flight_volume import FlightVolume
+from swarmctl.core.trajectory import Times, Trajectory
+from swarmctl.core.trajectory_message import TrajectoryMessage
+from swarmctl.core.types import Array, Phase, VehicleState
+
+_SUSPECT_US = 3_000_000  # without a message, after which a peer is suspected: twice what a token outlives its process
+_GAP_US = 1_000_000  # without a fresh state, after which nothing is committed any more
+_SAME_M = 1e-3  # tubes that differ by less are equal: messages round
+_CUT_OFF_US = 20_000_000  # at rest without the acknowledgements required, after which the agent lands where it is
+
+
+class Coordination:
+    """Connects the protocol of one agent to the bus, the world model and the events.
+
+    Args:
+        agent, boot_id: identity in the own messages.
+        peers: numbers of the other agents.
+        params, mpc, vehicle, separation, volume, max_keep_outs, stopwatch_ns: see `TrajectoryPlanner`.
+        world_model: paths, statuses and presence of peers, and obstacles.
+        bus: is drained by `receive`.
+        rate_hz: tick rate of every agent.
+        note: is told `conflicting_commitment` when a peer's committed trajectory comes too close to the own one;
+            `tracking_violation` when the vehicle leaves its tube, when that has another consequence, and when it is
+            held again; `membership` when the peers that are suspected, promised to be excluded, or excluded change;
+            and `commitments` with all counts when the autopilot or a pilot takes over.
+
+    Attributes:
+        committed_peers: by agent number, the trajectories that each peer relied on may follow. A silent peer is relied
+            on as well: it rests where its last commitment ends, also when a majority has excluded it.
+        lost_peer_keep_outs: keep-outs at the ends of lost peers' committed trajectories.
+        cut_off: why the agent has to land where it is: it waits for peers in vain, or they have excluded it; or "".
+        alert: what keeps it from committing to anything new, or nearly; or "".
+    """
+
+    def __init__(
+        self,
+        *,
+        agent: int,
+        boot_id: int,
+        peers: list[int],
+        params: CommitParams,
+        mpc: MpcParams,
+        vehicle: VehicleModelParams,
+        separation: SeparationParams,
+        volume: FlightVolume | None,
+        max_keep_outs: int,
+        world_model: WorldModel,
+        bus: Bus,
+        note: Callable[..., None],
+        stopwatch_ns: Callable[[], int],
+        rate_hz: float,
+    ) -> None:
+        self._agent, self._boot_id, self._bus, self._world_model = agent, boot_id, bus, world_model
+        planner = TrajectoryPlanner(
+            agent,
+            params,
+            mpc,
+            vehicle,
+            separation,
+            max_keep_outs=max_keep_outs,
+            stopwatch_ns=stopwatch_ns,
+            volume=volume,
+        )
+        self._commitments = Commitments(agent, params, planner)
+        refusals, presence = world_model.refusals, world_model.presence
+        self._peer_trajectories = PeerTrajectories(
+            peers, rate_hz, refusals, presence, agent=agent, clocks=world_model.clocks
+        )
+        self._peers = frozenset(peers)
+        self._note, self._seq, self._separation = note, 0, separation
+        self._is_committed = False
+        self._tube_m = separation.budget.tube_m
+        self._tube = Tube(self._tube_m)
+        self._grip = Grip.HELD
+        self._entered_now, self._entered_ahead = Encounters(), Encounters()  # where a plan begins now, or ahead
+        self._clock_error_max_us = 1e6 * params.clock_error_max_s
+        self._membership = Membership(agent, peers)
+        self._ended: frozenset[int] = frozenset()  # peers that take no part any more, by evidence
+        self._membership_said: tuple[frozenset[int], ...] = (frozenset(),) * 3
+        self._begun_us: int | None = None
+        self._stepped_us = 0  # time of the newest tick in which the agent flew
+        self._conflicting: set[int] = set()
+        self.committed_peers: Mapping[int, Sequence[Trajectory]] = {}
+        self.lost_peer_keep_outs: list[KeepOut] = []
+        self.cut_off = self.alert = ""
+
+    @property
+    def counts(self) -> CommitCounts:
+        """Return the counts of proposals so far."""
+        return self._commitments.counts
+
+    @property
+    def worst_tracking_m(self) -> float:
+        """Return how far the vehicle has been off what it had committed to, at most."""
+        return self._tube.worst_m
+
+    def receive(self, utc_us: int) -> None:
+        """Apply rule 1: take in every message that has arrived, and what it says about silent peers."""
+        for sender, payload in self._bus.receive(topics.TRAJECTORY):
+            self._peer_trajectories.offer(sender, payload, utc_us)
+        self._update_membership(utc_us)
+
+    def _update_membership(self, utc_us: int) -> None:
+        peers, membership = self._peer_trajectories, self._membership
+        self._ended = frozenset(agent for agent in self._peers if self._world_model.has_ended(agent))
+        suspected = {agent for agent in self._peers - self._ended if self._silence_us(agent, utc_us) > _SUSPECT_US}
+        told = {agent: message.exclusions for agent, message in peers.newest.items()}
+        membership.update(suspected, told, self._ended, votes=peers.heard_before_flight == self._peers)
+        said = (membership.exclusions.suspected, membership.exclusions.promised, membership.excluded)
+        if said != self._membership_said:
+            self._membership_said = said
+            suspected_, promised, excluded = (sorted(agents) for agents in said)
+            self._note("membership", suspected=suspected_, promised=promised, excluded=excluded)
+
+    def step(
+        self, utc_us: int, state: VehicleState, phase: Phase, desired: DesiredReference, *, disturbance_ned_m_s2: Array
+    ) -> None:
+        """Apply rules 2 to 4 while this agent flies.
+
+        Args:
+            utc_us: now.
+            state, phase: own vehicle and mission.
+            desired: motion that the agent would follow if it were alone.
+            disturbance_ned_m_s2: (3,) estimated acceleration by wind.
+        """
+        commitments = self._commitments
+        if not self._is_committed:
+            self._is_committed, self._begun_us = True, utc_us
+            commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
+        since_us, self._stepped_us = utc_us - self._stepped_us, utc_us
+        self._watch(utc_us, since_us, state)
+        known, required = self._peer_trajectories.newest, self._required_peers()
+        self.cut_off = self._why_cut_off(utc_us, required)
+        commitments.update(utc_us, known, required)
+        relied_on = self._relied_on(utc_us, known, required)
+        begin_us = utc_us + commitments.lead_us
+        now = Situation(
+            utc_us=utc_us,
+            begin_us=utc_us,
+            desired=self._paced(desired, begin_us),
+            peers={agent: known[agent] for agent in relied_on},
+            others=self._others(utc_us, state, phase, relied_on, self._entered_now),
+            disturbance_ned_m_s2=disturbance_ned_m_s2,
+        )
+        commitments.evade(now)
+        unsure = {a for a in required if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
+        self.alert = self._why_slow(unsure)
+        if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
+            heard = (relied_on & required) - self._absent()
+            others = self._others(begin_us, state, phase, heard, self._entered_ahead)
+            commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
+
+    def _relied_on(self, utc_us: int, known: Mapping[int, TrajectoryMessage], required: Set[int]) -> Set[int]:
+        """Return the peers whose commitments are relied on, and remember where lost ones end.
+
+        Silence alone is no reason to doubt a commitment: to shrink from a peer that is merely cut off is to leave the
+        own commitment, before peers that rely on that. Only what is newly planned keeps clear of what a silent peer's
+        autopilot may do instead (see `step`).
+        """
+        conflicting = self._commitments.conflicting_peers(utc_us, known)
+        if conflicting != self._conflicting:
+            self._conflicting = conflicting
+            self._note("conflicting_commitment", by=sorted(conflicting))
+        deviating = self._world_model.deviating_peers(known, utc_us, self._tube_m)
+        deviating |= {agent for agent, message in known.items() if message.tube_m > self._tube_m + _SAME_M}
+        committed = {agent for agent, message in known.items() if message.is_committed}
+        lost_peers = [agent for agent in known.keys() - required if agent in committed]
+        self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
+        relied_on = (required | self._membership.excluded - self._ended) & committed - conflicting - deviating
+        self.committed_peers = {agent: known[agent].followed for agent in relied_on}
+        return relied_on
+
+    def wait(self, utc_us: int, state: VehicleState | None) -> None:
+        """Keep what is committed while the state is stale for a moment; longer is `idle`.
+
+        The vehicle flies on: to commit anew at speed after each gap would surprise peers. Whether it has stayed in its
+        tube is seen with the next state.
+        """
+        if not self._is_committed or utc_us - self._stepped_us > _GAP_US:
+            self.idle(utc_us, state)
+
+    def idle(self, utc_us: int, state: VehicleState | None) -> None:
+        """Commit nothing while a pilot or the autopilot flies; peers are still acknowledged."""
+        if self._is_committed:
+            self._is_committed = False
+            self.committed_peers, self.lost_peer_keep_outs, self.cut_off, self.alert = {}, [], "", ""
+            self._note("commitments", **asdict(self.counts), worst_tracking_m=self.worst_tracking_m)
+        self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
+
+    def sample_committed(self, t_utc_us: Times) -> tuple[Array, Array]:
+        """Return the positions and velocities, (M, 3) NED each, to fly at times (M,)."""
+        assert self._commitments.flown is not None
+        return self._commitments.flown.sample(t_utc_us)
+
+    def publish(self, utc_us: int) -> None:
+        """Apply rule 5: publish the own message, once there is a committed trajectory."""
+        if self._commitments.committed is None:
+            return
+        self._seq += 1
+        exclusions = self._membership.exclusions
+        message = TrajectoryMessage(
+            agent=self._agent,
+            boot_id=self._boot_id,
+            seq=self._seq,
+            sent_utc_us=utc_us,
+            is_committed=self._is_committed,
+            committed=self._commitments.committed,
+            tube_m=self._tube.radius_m,
+            proposal=self._commitments.proposal,
+            acknowledged=acknowledgements(self._peer_trajectories.newest, self._ended | exclusions.promised),
+            exclusions=exclusions,
+            heard=self._peer_trajectories.heard(),
+        )
+        self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
+        peers = self._peer_trajectories
+        self._bus.relay(missed_by_peers(peers.newest, utc_us, peers.received_utc_us))
+
+    @property
+    def margin_m(self) -> float:
+        """Return by how much the own tube is wider than distances leave room for."""
+        return self._tube.radius_m - self._tube_m
+
+    def _paced(self, desired: DesiredReference, begin_us: int) -> DesiredReference:
+        """Return the desired motion, or a slower one from where the next plan begins while the tube is left far."""
+        if self._tube.pace_01 == 1.0:
+            return desired
+        assert self._commitments.flown is not None
+        return slowed(desired, np.array(self._commitments.flown.at(begin_us)[0]), self._tube.pace_01)
+
+    def _watch(self, utc_us: int, since_us: int, state: VehicleState) -> None:
+        """Commit anew, from the measured state, when the commitment is lost; report how well it is held."""
+        commitments = self._commitments
+        commitments.wait_for(state.pos_ned_m, utc_us, since_us, self._tube_m)
+        assert commitments.committed is not None and commitments.flown is not None
+        pos, vel = map(np.array, commitments.committed.at(utc_us))
+        error_m = float(np.linalg.norm(state.pos_ned_m - pos))
+        error_m_s = float(np.linalg.norm(state.vel_ned_m_s - vel))
+        late_m = math.dist(pos, commitments.flown.at(utc_us)[0])
+        if self._tube.update(utc_us, error_m, error_m_s, late_m):
+            commitments.restart(state.pos_ned_m, state.vel_ned_m_s, utc_us)
+        before, self._grip = self._grip, self._tube.grip(utc_us)
+        if self._grip is not before:
+            is_off, grip = self._grip is not Grip.HELD, self._grip.name
+            self._note("tracking_violation", begins=is_off, error_m=error_m, allowed_m=self._tube_m, grip=grip)
+
+    def _required_peers(self) -> frozenset[int]:
+        """Return peers that fly by commitments and have to acknowledge."""
+        participants = self._peers - self._membership.excluded - self._ended
+        return frozenset(agent for agent in participants if self._world_model.uses_commitments(agent))
+
+    def _absent(self) -> set[int]:
+        """Return peers whose liveliness token is not on the bus."""
+        alive = self._bus.alive()
+        return {agent for agent in self._peers if agent_name(agent) not in alive}
+
+    def _silence_us(self, agent: int, utc_us: int) -> int:
+        """Return the time since the newest message of a peer; 0 for one that has never been heard."""
+        return utc_us - self._peer_trajectories.received_utc_us.get(agent, utc_us)
+
+    def _why_slow(self, unsure: Set[int]) -> str:
+        if self._grip > Grip.OUTSIDE:
+            return f"blown off what it had committed to: {self._grip.name.lower()}"
+        return f"the clock of {_names(unsure)} is not known well enough" if unsure else ""
+
+    def _why_cut_off(self, utc_us: int, required: Set[int]) -> str:
+        if self._grip is Grip.LOST:
+            return "it can't hold what it commits to"
+        if by := self._membership.excluded_by:
+            return f"excluded by {_names(by)} after silence"
+        begun_us = utc_us if self._begun_us is None else self._begun_us
+        silent = [a for a in required if min(self._silence_us(a, utc_us), utc_us - begun_us) > _CUT_OFF_US]
+        return f"cut off from {_names(silent)}" if silent else ""
+
+    def _ends(self, message: TrajectoryMessage) -> list[KeepOut]:
+        budget = self._separation.budget
+        ends = [np.tile(trajectory.pos_ned_m[-1], (2, 1)) for trajectory in message.followed]
+        return [
+            KeepOut(
+                pos_ned_m=end,
+                radius_m=budget.planned_m,
+                hard_min_distance_m=budget.committed_m,
+                any_height=False,
+                priority_id=message.agent,
+                downwash=self._separation.downwash,
+            )
+            for end in ends
+        ]
+
+    def _others(
+        self, t0_utc_us: int, state: VehicleState, phase: Phase, without: Set[int], encounters: Encounters
+    ) -> KeepOuts:
+        """Return keep-outs of obstacles and of peers but those in `without`, on the planner's grid from `t0_utc_us` on.
+
+        What a stale peer does is unknown, so its hard minimum distance includes all of the margin that grows with age.
+        Those that are too close already say since which distance, so that plan by plan none comes closer.
+        """
+        assert self._commitments.flown is not None
+        steps, dt_us = self._commitments.steps, self._commitments.dt_us
+        found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase=phase, without=without)
+        spent_m = self._separation.budget.planned_beyond_hard_min_m
+        aged = (replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found)
+        return encounters.noted(
+            KeepOuts(aged, found.pos_ned_m) if found else found, np.array(self._commitments.flown.at(t0_utc_us)[0])
+        )
+
+
+def _names(agents: Iterable[int]) -> str:
+    return ", ".join(map(agent_name, sorted(agents)))

@@ -1,0 +1,82 @@
+"""Publishes the agent's own predicted path, with the margin that peers have to keep beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from swarmctl.agent.ports import Ports
+from swarmctl.agent.setup import AgentSetup
+from swarmctl.agent.sharing.path_sharing import PathSharing
+from swarmctl.bus import topics
+from swarmctl.bus.path_messages import encode_path
+from swarmctl.control.controllers.kind import Controller
+from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
+from swarmctl.control.estimation.gust import GustWatch
+from swarmctl.core.trajectory import grid
+from swarmctl.core.types import MAX_MARGIN_M, Array, Plan, PredictedPath, VehicleState
+
+
+class PathPublisher:
+    """Tells peers where the vehicle will be: along its plan, or at constant velocity while somebody else flies it.
+
+    Args:
+        setup: identity and parameters.
+        ports: bus and clock.
+        controller: its plans have the grid of the paths.
+        delay_us: from sending a setpoint to when it acts.
+        widens_in_gusts: peers keep more while the wind changes; commitments have tubes instead.
+    """
+
+    def __init__(
+        self, setup: AgentSetup, ports: Ports, controller: Controller, delay_us: int, *, widens_in_gusts: bool
+    ) -> None:
+        self._setup, self._ports, self._delay_us = setup, ports, delay_us
+        self._dt_us, self._steps, self._widens_in_gusts = controller.dt_us, controller.steps, widens_in_gusts
+        self._sharing = PathSharing(setup.params.path_sharing, setup.separation)
+        self._gust = GustWatch()
+
+    def publish(
+        self,
+        state: VehicleState | None,
+        flown: Plan | None,
+        seq: int,
+        *,
+        disturbance_ned_m_s2: Array,
+        margins_m: Iterable[float],
+    ) -> None:
+        """Publish the path of this tick, if peers need it and the vehicle has a state.
+
+        Args:
+            state: newest state.
+            flown: plan that is flown, None when the autopilot flies.
+            seq: number of the tick.
+            disturbance_ned_m_s2: (3,) estimate.
+            margins_m: what peers have to keep more, for each reason there is besides gusts.
+        """
+        if flown is None or not self._widens_in_gusts:
+            self._gust.forget()
+        else:
+            self._gust.update(self._ports.clock.now_us(), disturbance_ned_m_s2)
+        if state is None:
+            return
+        margin_m = min(MAX_MARGIN_M, sum((*margins_m, self._gust.margin_m)))
+        path = self._sharing.choose(self._path(state, flown, seq, margin_m))
+        if path is not None:
+            self._ports.bus.publish(topics.PATH, encode_path(path))
+
+    def _path(self, state: VehicleState, flown: Plan | None, seq: int, margin_m: float) -> PredictedPath:
+        if flown is not None:
+            t0_us, dt_us, pos = flown.t0_us, flown.dt_us, flown.pos_ned_m
+        else:
+            t0_us, dt_us = self._ports.clock.now_us() + self._delay_us, self._dt_us
+            ahead_s = grid(self._steps) * (dt_us * 1e-6) + (t0_us - state.t_us) * 1e-6
+            pos = predict_constant_velocity(state, ahead_s, self._setup.separation.brake_m_s2)
+        return PredictedPath(
+            agent=self._setup.agent,
+            boot_id=self._setup.boot_id,
+            seq=seq,
+            t0_utc_us=self._ports.utc_of_us(t0_us),
+            dt_us=dt_us,
+            margin_m=margin_m,
+            pos_ned_m=pos,
+        )

@@ -1,0 +1,29 @@
+"""What the parts of a tick hand on: the result of planning, and what was sent to the vehicle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.mpc.problem import Start
+from swarmctl.core.types import AttitudeSetpoint, Mode, Plan, Reference
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanningResult:
+    """Result of the planning part of a tick; all but `keep_outs` is None while the own state is stale."""
+
+    start: Start | None
+    plan: Plan | None  # also None while the autopilot flies
+    reference: Reference | None  # the mission's reference now, one point
+    keep_outs: list[KeepOut]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlOutput:
+    """Output of a tick: mode, flown plan and setpoint sent."""
+
+    mode: Mode
+    flown: Plan | None
+    setpoint: AttitudeSetpoint | None
+    safety_filter_acted: bool = False

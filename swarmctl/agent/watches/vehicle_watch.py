@@ -1,0 +1,61 @@
+"""Tells what a vehicle's link reveals besides the state: refused requests and frames, jumps, setpoints that stopped."""
+
+from __future__ import annotations
+
+from swarmctl.agent.ports import Ports
+from swarmctl.agent.watches.alerts import Alerts
+from swarmctl.mavlink.commands import CommandResult
+
+
+class VehicleWatch:
+    """Reports events of the vehicle's link.
+
+    Args:
+        ports: the vehicle; receives events of its requests, its words, its estimate, setpoints and frames.
+        alerts: are told what an operator should know of them.
+    """
+
+    def __init__(self, ports: Ports, alerts: Alerts) -> None:
+        self._ports, self._alerts = ports, alerts
+        self._gaps = self._jumps = 0  # already reported
+
+    def on_result(self, result: CommandResult, now_us: int) -> None:
+        """Report how the autopilot has answered a request."""
+        asked = f"{result.command.verb.value} {result.command.name}".rstrip()
+        if result.ok:
+            self._alerts.clear(asked)
+        else:
+            self._alerts.put(asked, f"{asked} refused: {result.text}", now_us)
+        self._ports.note("command", verb=asked, ok=result.ok, text=result.text)
+
+    def report_text(self) -> None:
+        """Record what the autopilot tells its operator, one message a tick: a flood must not fill the disk."""
+        if (said := self._ports.autopilot.next_text()) is not None:
+            self._ports.note("autopilot_text", severity=said.severity, text=said.text)
+
+    def report_jump(self, now_us: int) -> None:
+        """Report a jump of the vehicle's estimate, if there was one."""
+        frame = self._ports.autopilot.frame
+        if frame.jumps == self._jumps:
+            return
+        self._jumps = frame.jumps
+        text = f"estimate jumped by {frame.jump_m:.1f} m: peers keep that much more away"
+        self._alerts.put("jump", text, now_us)
+        self._ports.note("estimate_jumped", metres=frame.jump_m)
+
+    def report_gap(self, now_us: int, cause: str) -> None:
+        """Report that setpoints had stopped for too long, if they had; the cause is "" where it is not known."""
+        sent = self._ports.autopilot.setpoints
+        if sent.gaps == self._gaps:
+            return
+        self._gaps, gap_s = sent.gaps, sent.gap_s
+        stopped = cause or f"setpoints had stopped for {gap_s:.2f} s"
+        self._alerts.put("gap", f"{stopped}: the autopilot's failsafe may have acted", now_us)
+        self._ports.note("setpoint_gap", seconds=gap_s)
+
+    def report_refused_frames(self, now_us: int) -> None:
+        """Report the vehicle's frames that were refused."""
+        refusals, utc_us = self._ports.autopilot.refusals, self._ports.clock.utc_us()
+        refusals.report(utc_us, self._ports.note)
+        if text := refusals.alert(utc_us):
+            self._alerts.put("signing", text, now_us)

@@ -1,0 +1,46 @@
+"""Who has control of a vehicle, and how an agent asks for it. Pure."""
+
+from __future__ import annotations
+
+from swarmctl.control.phases.inputs import PhaseInputs
+from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
+from swarmctl.core.types import Command, FlightMode, Phase, VehicleState, Verb
+
+OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes that follow from our own requests
+
+
+def is_under_other_control(state: VehicleState) -> bool:
+    """Return whether a pilot, a ground station or a failsafe controls the vehicle."""
+    return state.mode not in OWN_MODES or state.failsafe
+
+
+def request_control(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    """Request control from the autopilot's own hold; from any other mode only after an operator's `resume`.
+
+    No setpoints may be sent meanwhile: PX4 returns to OFFBOARD by itself when they reappear after a failsafe.
+    """
+    if not mission.may_take_control and is_under_other_control(state):
+        leave_control(mission, inputs)
+        return []
+    return [Command(verb=Verb.EXTERNAL)] if mission.may_request(inputs) else []
+
+
+def take_control(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> None:
+    """Note that the autopilot follows our setpoints, and go to the start if that is next."""
+    if mission.had_control:
+        return
+    mission.had_control = True
+    if mission.phase is not Phase.GOTO_START:
+        return
+    target_ned_m = mission.climb.rest_ned_m(state) if mission.climb.cut_short else mission.start_ned_m
+    mission.trajectories.go_to(target_ned_m, inputs.now_us, state)
+    mission.trajectories.keep_destination()
+    if mission.held:
+        mission.interruptions.stay(inputs.now_us, state)
+
+
+def leave_control(mission: MissionState, inputs: PhaseInputs) -> None:
+    """Leave the vehicle to who has taken it: its autopilot, if setpoints have stopped."""
+    stopped = inputs.setpoints_stopped
+    mission.override(f"{stopped}: the autopilot took over" if stopped else TAKEN_OVER)
+    mission.setpoints_stopped = bool(stopped)

@@ -1,0 +1,238 @@
+"""Where one agent's mission stands: its phase, who has control, what is followed, and the transitions between. Pure.
+
+It decides nothing by itself: `control.phases.state_machine` does, tick by tick, with the steps of the phases and the
+operator's orders. Which trajectory is flown meanwhile is known to `Trajectories`, what holds or pauses the agent to
+`Interruptions`, and where it may land to `Landing`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarmctl.control.phases.arming import ArmingEvidence
+from swarmctl.control.phases.control_mode import control_mode
+from swarmctl.control.phases.departure import Climb
+from swarmctl.control.phases.inputs import PhaseInputs
+from swarmctl.control.phases.interruptions import Interruptions
+from swarmctl.control.phases.landing import Landing
+from swarmctl.control.phases.refused_orders import Contains
+from swarmctl.control.phases.state_machine_params import StateMachineParams
+from swarmctl.control.phases.trajectories import OfferedMission, Trajectories
+from swarmctl.control.reference.mission import MissionReference
+from swarmctl.core.flight_volume import FlightVolume
+from swarmctl.core.types import Array, Command, Landed, Mode, Phase, VehicleState
+
+REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
+SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
+PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
+TAKEN_OVER = "pilot or autopilot took over"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissionSetup:
+    """What a mission is told before it begins."""
+
+    agent: int  # index of this agent
+    peers: int  # number of the other agents
+    landing_m: float  # level distance to others at which it may land in place
+    start_ned_m: Array  # (3,) start position, also the landing place
+    duration_s: float  # of the tracked mission
+    reference: MissionReference  # of the tracked mission
+    contains: Contains = lambda _: True  # whether a place lies within the geofence
+    volume: FlightVolume | None = None  # to stay in
+
+
+class MissionState:
+    """What the phases of one agent's mission share.
+
+    Args:
+        params: speeds, tolerances and timeouts.
+        setup: place in the swarm, and the mission.
+
+    Attributes:
+        phase: current phase.
+        ready_utc_us: UTC at which the start position was reached, 0 before.
+        begin_utc_us: UTC of mission time 0, None until all are ready.
+        outcome: "completed", or why the mission was not; "" while it is under way.
+        waits_for: unmet condition that keeps the vehicle on the ground, or from beginning the mission; or "".
+        had_control: the autopilot follows our setpoints and control has not been given back.
+        pilot_override: pilot or autopilot took over; lasts until an operator resumes.
+        offered: the mission that the order `mission` has flown.
+        stop_verb: land or rtl, from the command until the stop begins.
+        may_take_control: an operator's resume permits taking control from any mode.
+        setpoints_stopped: the override has followed from that.
+        airborne: the vehicle was found in the air at start-up.
+        landing_seen: the autopilot lands, or has.
+        outcome_before: outcome before the override, restored by resume.
+        first_tick_us: monotonic time from which the patience with the start counts.
+        entered_us: monotonic time at which the phase was entered.
+        requested_us: monotonic time of the newest request to the autopilot.
+    """
+
+    def __init__(self, params: StateMachineParams, setup: MissionSetup) -> None:
+        self.params, self.contains, self.volume = params, setup.contains, setup.volume
+        self.peers = frozenset(range(setup.peers + 1)) - {setup.agent}
+        self.start_ned_m, self.mission_reference = setup.start_ned_m, setup.reference
+        self.duration_us = round(setup.duration_s * 1e6)
+        self.phase, self.boots = Phase.CONNECT, 0
+        self.outcome = self.outcome_before = self.waits_for = self.stop_verb = ""
+        self.ready_utc_us = self.entered_us = 0
+        self.begin_utc_us: int | None = None
+        self.first_tick_us: int | None = None
+        self.requested_us = -REQUEST_PERIOD_US
+        self.offered: OfferedMission | None = None
+        self.had_control = self.pilot_override = self.may_take_control = False
+        self.setpoints_stopped = self.airborne = self.landing_seen = False
+        self.arming, self.climb = ArmingEvidence(), Climb(setup.start_ned_m)
+        self.trajectories = Trajectories(
+            setup.reference, setup.start_ned_m, speed_m_s=params.speed_m_s, accel_m_s2=params.accel_m_s2
+        )
+        self.interruptions = Interruptions(self.trajectories)
+        self.landing = Landing(
+            params,
+            setup.agent,
+            setup.landing_m,
+            start_ned_m=setup.start_ned_m,
+            trajectories=self.trajectories,
+            volume=setup.volume,
+        )
+
+    # -- what is asked of it ------------------------------------------------------------------------------------------
+
+    @property
+    def finished(self) -> bool:
+        return self.phase is Phase.DONE
+
+    @property
+    def held(self) -> bool:
+        """Return whether the operator has asked to hold, or to go to a point."""
+        return self.interruptions.held
+
+    @property
+    def yaw_rad(self) -> float | None:
+        """Return the heading that the operator has asked for, None for the mission's."""
+        return self.interruptions.yaw_rad
+
+    @property
+    def may_fly_on(self) -> bool:
+        """Return whether the agent is not on its way to land, or is held there for as long as the operator likes."""
+        return self.phase < Phase.GOTO_LAND or (self.held and self.phase is Phase.GOTO_LAND)
+
+    @property
+    def follows_mission(self) -> bool:
+        """Return whether the reference is the mission's: nothing interrupts it."""
+        return self.phase is Phase.TRACK and not self.interruptions.active
+
+    @property
+    def place_offset_ned_m(self) -> Array:
+        """Return by how much the present reference (3,) is beside the one that several agents share."""
+        return self.mission_reference.offset_ned_m if self.follows_mission else np.zeros(3)
+
+    def reference(self, utc_us: int, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
+        """Return reference positions and velocities, (K, 3) each, NED, at `offsets_s` (K,) from now."""
+        if self.follows_mission and self.begin_utc_us is not None:
+            return self.trajectories.mission_reference(self.mission_t_s(utc_us), now_us, offsets_s)
+        return self.trajectories.reference(now_us, offsets_s)
+
+    def mission_yaw_rad(self, utc_us: int) -> float | None:
+        """Return the yaw of the mission's reference now; None while that is not followed."""
+        if not self.follows_mission or self.begin_utc_us is None:
+            return None
+        return self.mission_reference.yaw_at_rad(self.mission_t_s(utc_us))
+
+    def mission_t_s(self, utc_us: int) -> float:
+        """Return the mission time [s] while tracking, else NaN."""
+        if self.phase is not Phase.TRACK or self.begin_utc_us is None:
+            return math.nan
+        return (utc_us - self.begin_utc_us) * 1e-6
+
+    def ends_in_s(self, now_us: int, utc_us: int) -> float:
+        """Return when the mission, or what precedes or follows it, ends by itself [s]; NaN: it does not."""
+        if self.held or self.pilot_override or self.first_tick_us is None:
+            return math.nan
+        if self.phase < Phase.TRACK:
+            return self.params.start_timeout_s - (now_us - self.first_tick_us) * 1e-6
+        if self.phase is Phase.GOTO_LAND:
+            return self.params.land_timeout_s - (now_us - self.entered_us) * 1e-6
+        return self.duration_us * 1e-6 - self.mission_t_s(utc_us)
+
+    def control_mode(self, mode: Mode) -> str:
+        """Return what the vehicle is doing, for the operator; `mode` is that of the tick."""
+        return control_mode(
+            self.phase,
+            Mode.PILOT_OVERRIDE if self.pilot_override and mode is not Mode.STATE_STALE else mode,
+            held=self.held,
+            goes_to_point=self.interruptions.goes_to_point,
+            paused=self.interruptions.paused,
+            lands_in_place=self.landing.in_place,
+            setpoints_stopped=self.setpoints_stopped,
+        )
+
+    def is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:
+        """Return whether the vehicle is on the ground and known to be disarmed."""
+        return state.landed is Landed.ON_GROUND and self.arming.is_disarmed(inputs, state)
+
+    # -- transitions --------------------------------------------------------------------------------------------------
+
+    def enter(self, phase: Phase, now_us: int) -> None:
+        """Enter a phase; its requests may be made at once."""
+        self.phase = phase
+        if phase >= Phase.LAND:
+            self.interruptions.end_hold()
+        self.entered_us = now_us
+        self.requested_us = now_us - SPIN_UP_US
+
+    def may_request(self, inputs: PhaseInputs, every_us: int = REQUEST_PERIOD_US) -> bool:
+        """Return whether a request is due, which is made then."""
+        if inputs.busy or inputs.now_us - self.requested_us < every_us:
+            return False
+        self.requested_us = inputs.now_us
+        return True
+
+    def override(self, why: str) -> None:
+        """Note that pilot or autopilot took over."""
+        self.pilot_override, self.had_control, self.may_take_control = True, False, False
+        self.setpoints_stopped = False
+        self.outcome_before = self.outcome
+        self.outcome = why
+
+    def refuse(self, why: str, inputs: PhaseInputs) -> list[Command]:
+        """Give up before take-off: nothing is armed any more, and a vehicle that has been armed is disarmed."""
+        self.outcome = self.outcome or why
+        self.enter(Phase.LAND if self.arming.requested else Phase.DONE, inputs.now_us)
+        return []
+
+    def give_up(self, why: str, inputs: PhaseInputs, state: VehicleState) -> None:
+        """End the mission; only without a plan does the autopilot land the vehicle from where it is."""
+        self.outcome = self.outcome or why
+        if self.had_control and inputs.mode in PLAN_MODES:
+            self.stop_in_place(inputs.now_us, state)
+            return
+        self.enter(Phase.DONE if self.is_down(inputs, state) else Phase.LAND, inputs.now_us)
+
+    def go_home(self, now_us: int, state: VehicleState) -> None:
+        """Fly to the landing place."""
+        self.landing.go_home(now_us, state)
+        self.interruptions.end_hold()
+        self.enter(Phase.GOTO_LAND, now_us)
+
+    def stop_in_place(self, now_us: int, state: VehicleState) -> None:
+        """Brake and move away from others under the own plan, then let the autopilot land there."""
+        self.landing.stop_in_place(now_us, state)
+        self.interruptions.end_hold()
+        self.enter(Phase.GOTO_LAND, now_us)
+
+    def go_on(self, now_us: int, utc_us: int, state: VehicleState) -> None:
+        """Go on with what was interrupted: the transit, or the mission."""
+        if self.phase in (Phase.GOTO_START, Phase.READY, Phase.GOTO_LAND):
+            self.trajectories.go_to(self.trajectories.destination_ned_m, now_us, state)
+        else:
+            self.rejoin_mission(now_us, utc_us, state)
+
+    def rejoin_mission(self, now_us: int, utc_us: int, state: VehicleState) -> None:
+        """Return to the mission's moving reference, if it is under way."""
+        if self.phase is Phase.TRACK and self.begin_utc_us is not None:
+            self.trajectories.rejoin_mission(self.mission_t_s(utc_us), now_us, state)

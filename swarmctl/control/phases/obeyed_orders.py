@@ -1,0 +1,91 @@
+"""What an operator's orders change in a mission. Pure. Which are refused is said in `control.phases.refused_orders`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from swarmctl.control.phases.interruptions import HoldPoint
+from swarmctl.control.phases.mission_state import SPIN_UP_US, MissionState
+from swarmctl.core.operator_verbs import BEGIN, GOTO, MISSION, POINT, SPEED, YAW, Order
+from swarmctl.core.types import Landed, Phase, VehicleState
+
+OPERATOR_STOP = "stopped by the operator"
+
+
+def apply_stop(mission: MissionState, now_us: int, state: VehicleState) -> None:
+    """Begin the stop that has been commanded, unless it is under way."""
+    verb, mission.stop_verb = mission.stop_verb, ""
+    if not verb or mission.phase >= Phase.LAND:
+        return
+    mission.outcome = mission.outcome or OPERATOR_STOP
+    if mission.phase < Phase.GOTO_START or mission.pilot_override:
+        mission.enter(Phase.LAND, now_us)  # ends at once if the vehicle is known to be disarmed
+    elif verb == "rtl" and mission.may_fly_on:
+        mission.go_home(now_us, state)
+    elif verb == "land" and (mission.held or not mission.landing.in_place):
+        mission.stop_in_place(now_us, state)
+
+
+def _hold(mission: MissionState, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
+    if not mission.held:
+        mission.requested_us = now_us - SPIN_UP_US  # on the way up the autopilot is asked at once
+    autopilot_hovers = mission.phase <= Phase.GOTO_START and not mission.had_control
+    mission.interruptions.hold(now_us, state, brakes=not autopilot_hovers)
+
+
+def _goto(mission: MissionState, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
+    _hold(mission, order, now_us, utc_us, state)
+    arguments = order.arguments
+    point = HoldPoint(
+        ned_m=np.array([arguments[name] for name in POINT]),
+        speed_m_s=arguments.get(SPEED),
+        yaw_rad=math.radians(arguments[YAW]) if YAW in arguments else None,
+    )
+    mission.interruptions.move_hold(point, now_us, state)
+
+
+def _change_mission(mission: MissionState, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
+    """Fly the mission that is offered: from its begin on where one is flown already, else when all are ready."""
+    offered = mission.offered
+    assert offered is not None
+    mission.mission_reference, mission.duration_us = offered.reference, round(offered.duration_s * 1e6)
+    mission.trajectories.change_mission(offered.reference)
+    if mission.phase is Phase.TRACK:
+        mission.begin_utc_us = round(order.arguments[BEGIN] * 1e6)
+        if not mission.interruptions.active:
+            mission.rejoin_mission(now_us, utc_us, state)
+
+
+def _resume(mission: MissionState, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
+    if mission.held:
+        _release(mission, now_us, state)
+        if not mission.interruptions.paused:
+            mission.go_on(now_us, utc_us, state)
+    elif mission.pilot_override:
+        mission.rejoin_mission(now_us, utc_us, state)
+    if mission.pilot_override:
+        mission.pilot_override, mission.outcome, mission.may_take_control = False, mission.outcome_before, True
+
+
+def _release(mission: MissionState, now_us: int, state: VehicleState) -> None:
+    """End a hold: timeouts have not run meanwhile."""
+    mission.interruptions.end_hold()
+    mission.requested_us = now_us - SPIN_UP_US
+    if mission.phase is Phase.TAKEOFF and state.landed is not Landed.ON_GROUND:
+        mission.climb.cut()
+    if mission.first_tick_us is not None:
+        mission.first_tick_us += now_us - mission.interruptions.held_since_us
+    if mission.phase is Phase.GOTO_LAND:
+        mission.entered_us = now_us
+
+
+# by verb; stops are in `apply_stop`
+ORDERS: Mapping[str, Callable[[MissionState, Order, int, int, VehicleState], None]] = {
+    "hold": _hold,
+    "resume": _resume,
+    GOTO: _goto,
+    MISSION: _change_mission,
+}

@@ -1,0 +1,59 @@
+"""TAKEOFF and GOTO_START: the autopilot climbs, then the agent takes control and flies to the start. Pure."""
+
+from __future__ import annotations
+
+import math
+
+from swarmctl.control.phases import handover
+from swarmctl.control.phases.inputs import PhaseInputs
+from swarmctl.control.phases.mission_state import SPIN_UP_US, MissionState
+from swarmctl.control.phases.trajectories import is_at
+from swarmctl.core.types import Command, FlightMode, Landed, Phase, VehicleState, Verb
+
+
+def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    """Request the climb, and wait until the vehicle hovers; a hold interrupts it."""
+    climbed = mission.climb.update(inputs, state)
+    if climbed and not mission.held:
+        mission.enter(Phase.GOTO_START, inputs.now_us)
+        return []
+    if not state.armed:  # pilot or autopilot disarmed it: it is not armed again
+        mission.give_up("disarmed before take-off", inputs, state)
+        return []
+    if mission.held:
+        ours = state.mode is not FlightMode.HOLD and not handover.is_under_other_control(state)
+        return [Command(verb=Verb.HOLD)] if ours and mission.may_request(inputs) else []
+    if (
+        state.mode is not FlightMode.TAKEOFF
+        and state.landed is Landed.ON_GROUND
+        and mission.may_request(inputs, SPIN_UP_US)
+    ):
+        if state.mode is FlightMode.HOLD and inputs.arm_in is not None:  # where a hold has left it
+            mission.requested_us = inputs.now_us - SPIN_UP_US
+            return [Command(verb=Verb.EXTERNAL)]
+        return [Command(verb=Verb.TAKEOFF, value=mission.climb.height_m)]
+    return []
+
+
+def goto_start(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    """Take control, and fly to the start."""
+    if not mission.had_control:
+        if mission.trajectories.current is None:
+            mission.trajectories.stand(inputs.now_us, state)
+        return [] if mission.held else handover.request_control(mission, inputs, state)
+    if mission.interruptions.active:
+        return []
+    if mission.climb.cut_short:
+        _finish_climb(mission, inputs.now_us, state)
+    elif is_at(state, mission.start_ned_m, mission.params.arrive_m, mission.params.arrive_m_s):
+        mission.ready_utc_us = inputs.utc_us
+        mission.enter(Phase.READY, inputs.now_us)
+    return []
+
+
+def _finish_climb(mission: MissionState, now_us: int, state: VehicleState) -> None:
+    """Go to the start once the vehicle has climbed to its height."""
+    rest = mission.trajectories.current
+    if rest is not None and is_at(state, rest.trajectory.to_ned_m, mission.params.arrive_m, math.inf):
+        mission.climb.finish()
+        mission.trajectories.go_to(mission.start_ned_m, now_us, state)

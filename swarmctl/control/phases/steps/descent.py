@@ -1,0 +1,50 @@
+"""GOTO_LAND and LAND: the agent flies to where it may land, then its autopilot lands it. Pure.
+
+A vehicle found in the air at start-up is handed back in the air, in the autopilot's hold.
+"""
+
+from __future__ import annotations
+
+from swarmctl.control.phases import handover
+from swarmctl.control.phases.inputs import PhaseInputs
+from swarmctl.control.phases.mission_state import PLAN_MODES, TAKEN_OVER, MissionState
+from swarmctl.core.types import Command, FlightMode, Landed, Phase, VehicleState, Verb
+
+
+def goto_land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    """Fly to the landing place; after too long, land where the vehicle is."""
+    if mission.held:
+        return []
+    landing, controls = mission.landing, mission.had_control
+    waited_us = inputs.now_us - mission.entered_us
+    if landing.is_reached(inputs, state, controls=controls, paused=mission.interruptions.paused):
+        mission.enter(Phase.LAND, inputs.now_us)
+    elif waited_us > mission.params.land_timeout_s * 1e6:
+        if landing.is_possible_here(inputs, state, controls=controls) or inputs.mode not in PLAN_MODES:
+            mission.enter(Phase.LAND, inputs.now_us)
+        else:
+            mission.stop_in_place(inputs.now_us, state)
+    return []
+
+
+def land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    """Have the autopilot land, and disarm, or give the vehicle back in the air."""
+    mission.had_control = False
+    if mission.airborne:  # found in the air, handed back in the air
+        if state.mode is not FlightMode.EXTERNAL:
+            mission.enter(Phase.DONE, inputs.now_us)
+            return []
+        return [Command(verb=Verb.HOLD)] if mission.may_request(inputs) else []
+    if mission.is_down(inputs, state):
+        mission.enter(Phase.DONE, inputs.now_us)
+        return []
+    if state.mode is FlightMode.LAND:
+        mission.landing_seen = True
+        return []
+    ours = state.mode in handover.OWN_MODES and not mission.landing_seen  # else a pilot flies, or aborted the landing
+    if not ours and state.landed is not Landed.ON_GROUND:
+        mission.override(TAKEN_OVER)
+        return []
+    if not mission.may_request(inputs):
+        return []
+    return [Command(verb=Verb.DISARM if state.landed is Landed.ON_GROUND else Verb.LAND)]

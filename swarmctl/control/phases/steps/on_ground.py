@@ -1,0 +1,51 @@
+"""STANDBY and ARM: a vehicle is armed once all agents stand by. Pure."""
+
+from __future__ import annotations
+
+from swarmctl.control.phases import handover
+from swarmctl.control.phases.departure import unmet_start_condition
+from swarmctl.control.phases.inputs import PhaseInputs
+from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
+from swarmctl.core.types import Command, FlightMode, Landed, Phase, VehicleState, Verb
+
+
+def standby(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    """Wait until every start condition is met."""
+    if not inputs.prepared:  # the autopilot has rebooted since CONNECT
+        mission.waits_for = "the link to be set up again after a reboot of the autopilot"
+        return []
+    if inputs.refusal:
+        return mission.refuse(inputs.refusal, inputs)
+    phases = {peer.phase for peer in inputs.peers().values() if peer.alive}
+    if Phase.TRACK in phases:  # peers may fly where this vehicle would climb, and its autopilot avoids nobody
+        return mission.refuse("the mission has begun without it", inputs)
+    if phases and max(phases) > Phase.TRACK:
+        return mission.refuse("a peer gave up before take-off", inputs)
+    mission.waits_for = unmet_start_condition(inputs, state, mission.peers - inputs.excused)
+    if not mission.waits_for:
+        mission.climb.begin(state)
+        mission.airborne = state.landed is Landed.IN_AIR
+        mission.enter(Phase.ARM, inputs.now_us)
+        return []
+    stays = state.mode is FlightMode.EXTERNAL and inputs.arm_in is None and not inputs.armable
+    if stays and not state.armed and mission.may_request(inputs):
+        return [Command(verb=Verb.HOLD)]  # PX4 stays in OFFBOARD after a landing, where it can't be armed
+    return []
+
+
+def arm(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    """Request arming, in the flight mode that the autopilot requires for it."""
+    if state.armed and mission.airborne and not mission.may_take_control and handover.is_under_other_control(state):
+        mission.override(TAKEN_OVER)  # decided before the first setpoint, which would already take control
+        return []
+    if state.armed:
+        mission.enter(Phase.GOTO_START if mission.airborne else Phase.TAKEOFF, inputs.now_us)
+        return []
+    if inputs.refusal:
+        return mission.refuse(inputs.refusal, inputs)
+    if not mission.may_request(inputs):
+        return []
+    if inputs.arm_in not in (None, state.mode):
+        return [Command(verb=Verb.EXTERNAL)]
+    mission.arming.request()
+    return [Command(verb=Verb.ARM)]

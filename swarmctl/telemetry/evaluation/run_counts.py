@@ -1,0 +1,109 @@
+"""What is counted over a run and not judged: solver, communication, deadlocks, commitments. Pure."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.core.types import Array, Mode, PlanStatus
+from swarmctl.telemetry.evaluation.reception import unresponsive
+from swarmctl.telemetry.evaluation.tracks import (
+    flight_rows,
+)
+from swarmctl.telemetry.json_safe import finite
+
+_CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
+_SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
+
+
+def solver_counts(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
+    """Count solver failures while the agent had control, and find the largest residual of a plan that was flown."""
+    flights = [flight_rows(rows) for rows in ticks.values()]
+    charged = [rows[np.isin(rows["mode"], _CONTROLLED)] for rows in flights]
+    residuals = [
+        rows["residual_m"][(rows["iterations"] > 0) & (rows["plan_status"] == PlanStatus.OK)] for rows in flights
+    ]
+    return {
+        "name": name,
+        "failed": sum(int(np.isin(rows["plan_status"], _SOLVER_FAILED).sum()) for rows in charged),
+        "not_certified": sum(int((rows["plan_status"] == PlanStatus.NOT_CERTIFIED).sum()) for rows in charged),
+        "max_residual_m": percentiles(residuals)["max"],
+        "safety_filter_ticks": sum(int(rows["safety_filter_acted"].sum()) for rows in flights),
+    }
+
+
+def communication(
+    ticks: Mapping[int, NDArray[np.void]], events: Sequence[Mapping[str, Any]], time_field: str
+) -> dict[str, Any]:
+    """Summarise plan staleness, messages sent, messages and frames refused, unresponsive peers, sessions replaced."""
+    ages = percentiles([flight_rows(rows)["plan_staleness_ms"] for rows in ticks.values()])
+    return {
+        "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
+        "sent": _sent(events),
+        "rejected": _refused(events, "bus_summary", "rejected"),
+        "refused_frames": _refused(events, "link_summary", "refused"),
+        "unresponsive": unresponsive(events, time_field),
+        "reopened": sum(event.get("event") == "bus_reopened" for event in events),
+    }
+
+
+def _last_of_each_source(events: Sequence[Mapping[str, Any]], name: str) -> Iterable[Mapping[str, Any]]:
+    return {event.get("source"): event for event in events if event.get("event") == name}.values()
+
+
+def _sent(events: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+    """Add up messages and bytes by topic in the last summary of each agent."""
+    total: dict[str, Counter[str]] = {}
+    for summary in _last_of_each_source(events, "bus_summary"):
+        topics = summary.get("sent")
+        for topic, counts in topics.items() if isinstance(topics, dict) else ():
+            if isinstance(counts, dict):
+                found = {key: int(counts[key]) for key in ("messages", "bytes") if finite(counts.get(key)) is not None}
+                total.setdefault(str(topic), Counter()).update(found)
+    return {topic: dict(counts) for topic, counts in sorted(total.items())}
+
+
+def _refused(events: Sequence[Mapping[str, Any]], name: str, field: str) -> dict[str, int]:
+    """Add up the counts by reason in the last event of a name from each source."""
+    refused: Counter[str] = Counter()
+    for event in _last_of_each_source(events, name):
+        reasons = event.get(field)
+        if isinstance(reasons, dict):
+            refused.update({str(reason): int(n) for reason, n in reasons.items() if finite(n) is not None})
+    return dict(sorted(refused.items()))
+
+
+def deadlock_counts(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Count deadlocks, those that were not resolved, and the longest duration."""
+    noticed = [event for event in events if event.get("event") == "deadlock"]
+    lasted_s = [seconds for event in noticed if (seconds := finite(event.get("lasted_s"))) is not None]
+    begun = sum(event.get("begins") is True for event in noticed)
+    return {"count": begun, "longest_s": max(lasted_s, default=None), "unresolved": begun - len(lasted_s)}
+
+
+def commitment_counts(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Sums over agents of what they counted by their last `commitments` event; None where nothing was guaranteed."""
+    last = {event.get("source"): event for event in events if event.get("event") == "commitments"}
+    if not last:
+        return None
+    names = ("proposed", "committed", "withdrawn", "expired", "unplanned", "evasive")
+    worst_m = max(finite(event.get("worst_tracking_m")) or 0.0 for event in last.values())
+    off = sum(event.get("event") == "tracking_violation" and event.get("begins") is True for event in events)
+    return {name: sum(int(finite(event.get(name)) or 0) for event in last.values()) for name in names} | {
+        "worst_tracking_m": worst_m,
+        "tracking_violation": off,
+    }
+
+
+def percentiles(parts: Sequence[Array]) -> dict[str, float | None]:
+    """Return median, 99th percentile and maximum of the finite values."""
+    values = np.concatenate([np.asarray(part, np.float64) for part in parts]) if parts else np.zeros(0)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return {"p50": None, "p99": None, "max": None}
+    p50, p99 = np.percentile(values, [50, 99])
+    return {"p50": float(p50), "p99": float(p99), "max": float(values.max())}

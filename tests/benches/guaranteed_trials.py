@@ -1,0 +1,21 @@
+"""Trials of swarms that fly by commitments, and the distances that they have to keep."""
+
+from __future__ import annotations
+
+from sitl.studies.campaign.flight import TrialFlight
+from sitl.studies.campaign.scenarios import layout_of
+from sitl.studies.campaign.trials import Cell, Trial
+
+COMMITTED_M = 0.8
+TOUCH_M = 0.48
+TUBE_M = 0.5 * (COMMITTED_M - TOUCH_M)
+
+
+def flown(cell: Cell, seed: int = 1) -> TrialFlight:
+    flight = TrialFlight(Trial(cell, seed), layout_of(cell.scenario, seed, cell.agents))
+    flight.run()
+    return flight
+
+
+def events(flight: TrialFlight, name: str) -> list[dict[str, object]]:
+    return [event for log in flight.lockstep.logs for event in log.events if event["event"] == name]

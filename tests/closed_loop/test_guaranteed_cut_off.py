@@ -1,0 +1,170 @@
+"""Swarms that fly by commitments while peers are cut off, frozen or out of reach for seconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Set
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sitl.studies.campaign.events import Freeze, ScenarioEvent, Split
+from sitl.studies.campaign.flight import TrialFlight, drawn
+from sitl.studies.campaign.scenarios import layout_of
+from sitl.studies.campaign.trials import Cell, Trial
+from swarmctl.agent.planning import coordination
+from swarmctl.agent.planning.coordination import Coordination
+from swarmctl.agent.planning.separation_policy import Guaranteed
+from swarmctl.bus.peers import agent_name
+from tests.benches.guaranteed_trials import COMMITTED_M, TOUCH_M, events
+
+
+def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
+    """How many trajectories are committed from 1.6 s to 2 s after the bus has fallen apart."""
+    flight = TrialFlight(
+        Trial(
+            Cell(
+                scenario="swap", agents=4, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
+            ),
+            1,
+        ),
+        layout_of("swap", 1, 4),
+    )
+    step, counts = flight.lockstep.step, []
+    began_us: list[int] = []
+
+    def watched() -> None:
+        step()
+        if flight._tracking() and not began_us:
+            began_us.append(flight.lockstep.clock.now_us())
+            flight.lockstep.hub.fail()
+        policies = [agent._separation for agent in flight._agents if agent is not None]
+        counts.append(sum(p.coordination.counts.committed for p in policies if isinstance(p, Guaranteed)))
+
+    while not began_us or flight.lockstep.clock.now_us() < began_us[0] + 2_000_000:
+        watched()
+    return counts[-1] - counts[-21]
+
+
+def only_seen(self: Coordination) -> Set[int]:
+    """Return peers whose token is seen, as if the others had died."""
+    return frozenset(agent for agent in self._peers if agent_name(agent) in self._bus.alive())
+
+
+def test_an_agent_off_the_bus_commits_nothing() -> None:
+    assert committed_in_the_dark() == 0
+
+
+def test_negative_control_taking_stale_peers_for_lost_commits_against_alive_peers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Coordination, "_required_peers", only_seen)
+    assert committed_in_the_dark() > 4
+
+
+def disturbed(event: ScenarioEvent, lost: Set[int] = frozenset(), limit_s: float = 12.0) -> TrialFlight:
+    """Four agents that swap; those in `lost` need not arrive, and nobody has to stay in the mission."""
+    cell = Cell(
+        scenario="swap", agents=4, delay_ms=50.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
+    )
+    layout = replace(layout_of("swap", 1, 4), events=(event,), limit_s=limit_s, lost=frozenset(lost))
+    flight = TrialFlight(Trial(cell, 1), layout)
+    flight.run()
+    return flight
+
+
+def halves(for_s: float = math.inf) -> Split:
+    """Half a second after the mission has begun, two and two no longer hear each other."""
+    return Split([frozenset({0, 1}), frozenset({2, 3})], 0.5, for_s)
+
+
+def test_two_halves_that_are_cut_off_from_each_other_both_come_to_rest() -> None:
+    flight = disturbed(halves())
+    assert flight.monitor.min_separation_m >= COMMITTED_M
+    assert np.linalg.norm(flight.lockstep.world.plant.vel_ned_m_s, axis=0).max() < 0.1
+    told = events(flight, "membership")
+    assert len(told) == 4 and all(len(e["suspected"]) == 2 and e["excluded"] == [] for e in told)  # type: ignore[arg-type]
+
+
+def test_halves_that_hear_each_other_again_in_time_go_on() -> None:
+    row = disturbed(halves(for_s=4.0), limit_s=20.0).row(None)
+    assert row["outcome"] == "arrived"
+    assert row["min_separation_m"] >= COMMITTED_M
+
+
+def test_negative_control_halves_that_take_missing_tokens_for_deaths_collide(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Coordination, "_required_peers", only_seen)
+    assert disturbed(halves()).monitor.collided
+
+
+def two_of_six_cut_off() -> TrialFlight:
+    """A host with two agents is cut off from two other hosts in the middle of a swap, for 5 s."""
+    cell = Cell(
+        scenario="swap", agents=6, delay_ms=20.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
+    )
+    event = Split([frozenset({0, 1, 2, 3}), frozenset({4, 5})], 2.5, 5.0)
+    layout = replace(layout_of("swap", 1, 6), events=(event,), limit_s=9.0, lost=frozenset({4, 5}))
+    flight = TrialFlight(Trial(cell, 1), layout)
+    flight.run()
+    return flight
+
+
+def evasions(flight: TrialFlight) -> int:
+    policies = [agent._separation for agent in flight._agents if agent is not None]
+    return sum(policy.coordination.counts.evasive for policy in policies if isinstance(policy, Guaranteed))
+
+
+def test_nobody_leaves_a_commitment_before_peers_that_are_merely_cut_off() -> None:
+    flight = two_of_six_cut_off()
+    assert flight.monitor.min_separation_m >= COMMITTED_M
+    assert evasions(flight) == 0
+    excluded = [e for e in events(flight, "membership") if e["excluded"]]
+    assert {str(e["source"]) for e in excluded} == {agent_name(i) for i in range(4)}
+    assert all(e["excluded"] == [4, 5] for e in excluded)
+
+
+def test_negative_control_agents_that_doubt_silent_peers_evade(monkeypatch: pytest.MonkeyPatch) -> None:
+    relied_on = Coordination._relied_on
+
+    def only_heard(self: Coordination, utc_us: int, *messages: Any) -> Set[int]:
+        heard = relied_on(self, utc_us, *messages) - self._absent() - self._membership.excluded
+        self.committed_peers = {agent: self.committed_peers[agent] for agent in heard}
+        return heard
+
+    monkeypatch.setattr(Coordination, "_relied_on", only_heard)
+    flight = two_of_six_cut_off()
+    assert evasions(flight) > 4
+    assert len(events(flight, "tracking_violation")) > 2, "pushed by safety filters, some leave their tubes"
+
+
+def test_the_others_go_on_without_a_frozen_agent_once_they_agree() -> None:
+    """Its process is stopped: its token stays on the bus, and its autopilot lands the vehicle."""
+    flight = disturbed(Freeze(3, 1.5, math.inf), lost={3}, limit_s=25.0)
+    assert flight.row(None)["outcome"] == "arrived"
+    assert flight.monitor.min_separation_m >= TOUCH_M
+    excluded = [e for e in events(flight, "membership") if e["excluded"]]
+    assert {e["source"] for e in excluded} == {agent_name(i) for i in range(3)}
+    assert all(e["excluded"] == [3] for e in excluded)
+
+
+@pytest.mark.parametrize("relayed", [True, False], ids=["", "control: nobody relays"])
+def test_all_arrive_although_links_fail_for_seconds(relayed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each direction between two agents delivers nothing for two fifths of the time, 2 s at once."""
+    if not relayed:
+        monkeypatch.setattr(coordination, "missed_by_peers", lambda *_: [])
+    cell = Cell(
+        scenario="swap",
+        agents=4,
+        delay_ms=0.0,
+        loss=0.0,
+        noise="exact",
+        wind_m_s=0.0,
+        protections="guaranteed",
+        disturbance="bursts:0.4",
+    )
+    flight = TrialFlight(Trial(cell, 2), replace(drawn(cell, 2), limit_s=12.0))
+    flight.run()
+    assert flight.monitor.min_separation_m >= 0.8
+    assert flight.row(None)["arrived"] is relayed
