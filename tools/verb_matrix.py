@@ -38,8 +38,8 @@ _OTHERS_S = 6.0
 _START_S, _END_S = 60.0, 120.0
 _SLOW_M_S = 0.3
 _TRIES = 3
-# GOTO_START from the height of a take-off to this one takes seconds, and not none.
-_SLOW_TRANSIT = ("--set=start.center_ned_m=[0,0,-5]", "--set=agent.state_machine.speed_m_s=0.5")
+# A climb ends where the mission begins: GOTO_START would be over at once, if it were not for a centimetre.
+_LONG_TRANSIT = ("--set=agent.state_machine.arrive_m=0.02", "--set=agent.state_machine.arrive_m_s=0.02")
 
 # What a status shows of an order that is obeyed.
 _EFFECTS: Mapping[str, Callable[[StatusMessage], bool]] = {
@@ -58,7 +58,7 @@ class Launch:
 
     def __init__(self, directory: Path) -> None:
         command = [sys.executable, "-m", "swarmctl", "launch", "--agents", str(AGENTS), "--duration", "12", "--no-view"]
-        command += ["--set=sitl.ground_z_m=1", *_SLOW_TRANSIT, f"--run-dir={directory}"]
+        command += ["--set=sitl.ground_z_m=1", *_LONG_TRANSIT, f"--run-dir={directory}"]
         self._directory = directory
         with (directory.parent / "output.txt").open("wb") as output:
             self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
