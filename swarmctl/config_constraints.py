@@ -35,7 +35,7 @@ def own_controller_problems(
 def separation_problems(
     separation: SeparationParams, model: VehicleModelParams, limits: LimitParams, agents: int, drift_m: float
 ) -> Iterator[str]:
-    """Yield which distances do not suffice, or can\'t be known."""
+    """Yield which distances do not suffice, or can't be known."""
     if agents > 1 and (problem := radius_problem(separation, 0.0, drift_m)):
         yield problem
     if separation.gust_m_s and not model.drag_1_s:

@@ -182,7 +182,7 @@ class Agent:
         self._advance(now_us, state)
         self._report_refusals(now_us)
         self._publisher.active_alert = self._alerts.newest(now_us)
-        return self._publisher.publish(
+        record = self._publisher.record(
             now_us,
             state,
             planning,
@@ -194,6 +194,8 @@ class Agent:
             deadline_misses=deadline_misses,
             timing=self.timing,
         )
+        self._publisher.publish(record, self._mission)
+        return record
 
     def _timing(self, began_ns: int, sensed_ns: int, planned_ns: int, sent_ns: int, plan: Plan | None) -> TickTiming:
         times, agreeing_ns = NO_TIMES if plan is None else plan.times, self._planner.directive.duration_ns

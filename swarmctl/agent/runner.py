@@ -22,6 +22,7 @@ from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.peers import Bus, LocalHub, agent_name
 from swarmctl.bus.relay import RelayingBus
+from swarmctl.bus.silence import SessionWatch
 from swarmctl.bus.zenoh_bus import NO_BUS
 from swarmctl.config import Config, load, own_identity
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
@@ -90,25 +91,6 @@ class StopOrder:
             self._due_us = now_us
         if self._due_us is not None and now_us >= self._due_us:
             self._due_us = now_us + _STOP_REPEAT_US if self._ask(Order("land"), now_us) else None
-
-
-class SessionWatch:
-    """Records when another session has taken the place of a deaf one.
-
-    Args:
-        bus: whose sessions.
-        note: takes the name and fields of an event.
-    """
-
-    def __init__(self, bus: Bus, note: Callable[..., None]) -> None:
-        self._bus, self._note = bus, note
-        self._reopened = 0
-
-    def step(self) -> None:
-        """Record what is new. Called once in every tick."""
-        if (reopened := self._bus.reopened()) > self._reopened:
-            self._reopened = reopened
-            self._note("bus_reopened", count=reopened)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

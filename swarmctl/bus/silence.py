@@ -1,4 +1,4 @@
-"""When a participant of the bus has to take its own session for deaf. Pure: time is an argument.
+"""When a participant of the bus takes its own session for deaf, and when another has taken over. Time is an argument.
 
 Silence is no evidence against those who are silent: the session may have lost its ear. Where many speak several times a
 second, a session on which nobody at all is heard for seconds is replaced by another one, which costs milliseconds. If
@@ -7,6 +7,13 @@ that one is as silent, silence is what it seems.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from swarmctl.bus.peers import Bus
+
+REOPENED = "bus_reopened"  # event of agents, supervisors and stations
 DEAF_S = 3.0  # supervisors repeat the obstacles each second, agents publish five statuses and fifty paths
 _LONGEST_S = 48.0  # between two attempts while silence goes on
 _MOST_STEP_S = 0.5  # counted of the time between two looks: a process that did not run has heard nothing
@@ -37,4 +44,26 @@ class SilenceWatch:
         if not self._has_heard or self._silent_s < self._limit_s:
             return False
         self._silent_s, self._limit_s = 0.0, min(2.0 * self._limit_s, _LONGEST_S)
+        return True
+
+
+class SessionWatch:
+    """Records when another session has taken the place of a deaf one.
+
+    Args:
+        bus: whose sessions.
+        note: takes the name and fields of an event.
+    """
+
+    def __init__(self, bus: Bus, note: Callable[..., None]) -> None:
+        self._bus, self._note = bus, note
+        self._reopened = 0
+
+    def step(self) -> bool:
+        """Record what is new; return whether anything is."""
+        reopened = self._bus.reopened()
+        if reopened <= self._reopened:
+            return False
+        self._reopened = reopened
+        self._note(REOPENED, count=reopened)
         return True

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 from swarmctl.bus.json_messages import StatusMessage, decode_status
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.refusals import HARMLESS, IDENTITY, MALFORMED, Refusals
+from swarmctl.bus.silence import SessionWatch
 from swarmctl.bus.topics import STATUS
 from swarmctl.ops.status_table import Display
 
-REOPENED = "bus_reopened"  # event of supervisors, stations and agents
+_REOPENED = "another session of the bus has taken over: the one before may have been deaf"
 
 
 class BusReport:
@@ -24,9 +26,10 @@ class BusReport:
     """
 
     def __init__(self, bus: Bus, note: Callable[..., None], display: Display) -> None:
-        self._bus, self._note, self._display = bus, note, display
+        self._bus, self._display = bus, display
         self._refusals = Refusals(note)
-        self._reopened = 0
+        self._sessions = SessionWatch(bus, partial(note, text=_REOPENED))
+        self._has_told_reopened = False
 
     def statuses(self) -> Iterator[StatusMessage]:
         """Yield the statuses that have arrived, each by the agent it is of; the others are refused."""
@@ -42,13 +45,9 @@ class BusReport:
         for message in self._bus.refused():
             self._refuse(*message)
         self._refusals.report(time.time_ns() // 1000)
-        reopened = self._bus.reopened()
-        if reopened > self._reopened:
-            text = "another session of the bus has taken over: the one before may have been deaf"
-            self._note(REOPENED, text=text, count=reopened)
-            if not self._reopened:  # while there is nobody, that happens again and again
-                self._display.print_line(text)
-            self._reopened = reopened
+        if self._sessions.step() and not self._has_told_reopened:  # while there is nobody, it happens again and again
+            self._has_told_reopened = True
+            self._display.print_line(_REOPENED)
 
     def _refuse(self, sender: str, topic: str, reason: str) -> None:
         if self._refusals.add(sender, topic, reason, time.time_ns() // 1000) == 1 and reason not in HARMLESS:

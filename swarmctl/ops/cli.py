@@ -116,9 +116,9 @@ def launch(
     from swarmctl.config import load
     from swarmctl.ops.launch import LaunchOptions
     from swarmctl.ops.launch import launch as fly
-    from swarmctl.telemetry.view.recordings import has_display
+    from swarmctl.telemetry.view.recordings import wants_window
 
-    options = LaunchOptions(run_dir, has_display() and not web if view is None else view, web)
+    options = LaunchOptions(run_dir, wants_window(view, web=web), web)
     return fly(load(config, _overrides(agents, duration, seed, sets)), options)
 
 

@@ -204,11 +204,6 @@ class Launcher(Services):
             raise StartError("the bus is not up")
         return self.bus
 
-    def tell(self, event: str, text: str, **fields: str) -> None:
-        """Record an event, and show its text."""
-        self.log.write(event, text=text, **fields)
-        self.display.print_line(text)
-
     def restart_router(self) -> None:
         """Start the router again where the ended one was; everybody's session finds it by itself."""
         self._spawn(router_command(self._config, self.context, self._links))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from swarmctl.bus.json_messages import decode_obstacles
@@ -26,7 +27,7 @@ from swarmctl.ops.host import refuse_unidentified, shared_run_name
 from swarmctl.ops.launch import LaunchOptions, SwarmPart, started
 from swarmctl.ops.launch_result import LaunchResult
 from swarmctl.ops.processes import ROUTER, VIEWER
-from swarmctl.ops.status_table import AgentView, Display
+from swarmctl.ops.status_table import AgentView, Display, tell
 from swarmctl.ops.summary import sum_up
 from swarmctl.ops.viewer_watch import ViewerWatch
 from swarmctl.process_lifetime import StopRequest
@@ -57,7 +58,8 @@ def run_station(config: Config, options: LaunchOptions) -> int:
                 services.display,
                 note=services.log.write,
             )
-            viewer = ViewerWatch(services.children.get(VIEWER), services.tell, services.announce)
+            told = partial(tell, services.log, services.display)
+            viewer = ViewerWatch(services.children.get(VIEWER), told, services.announce)
             router = services.children[ROUTER]
             while not (stop.count or watch.step()):
                 viewer.step()

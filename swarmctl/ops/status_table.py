@@ -13,7 +13,7 @@ import textwrap
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, TextIO
+from typing import Any, Literal, Protocol, TextIO
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -25,6 +25,7 @@ from swarmctl.bus.peers import agent_name
 from swarmctl.control.phases.control_mode import ControlMode
 from swarmctl.core.text import printable
 from swarmctl.core.types import FlightMode, Phase
+from swarmctl.telemetry.recording.event_log import EventLog
 
 REFRESH_HZ = 4.0
 _LINE = 2000  # longest printed line
@@ -77,6 +78,12 @@ class Display(Protocol):
 
     def close(self) -> None:
         """Leave the last state on the screen."""
+
+
+def tell(log: EventLog, display: Display, event: str, text: str, **fields: Any) -> None:
+    """Record an event, and show its text."""
+    log.write(event, text=text, **fields)
+    display.print_line(text)
 
 
 def open_display(stream: TextIO | None = None, run: str = "") -> Display:

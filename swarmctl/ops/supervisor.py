@@ -9,7 +9,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
-from typing import Any
+from functools import partial
 
 from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import Bus, agent_name
@@ -25,7 +25,7 @@ from swarmctl.ops.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
-from swarmctl.ops.status_table import AgentView, Display, name_of
+from swarmctl.ops.status_table import AgentView, Display, name_of, tell
 from swarmctl.ops.viewer_watch import ViewerWatch
 from swarmctl.telemetry.recording.event_log import EventLog
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
@@ -74,6 +74,7 @@ class FlightSupervisor:
         self._services = services
         self._bus: Bus = services.bus
         self._display = display
+        self._announce = partial(tell, services.log, display)
         self._result = LaunchResult()
         self._viewer_watch = ViewerWatch(services.children.get(VIEWER), self._announce, services.announce)
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
@@ -336,10 +337,6 @@ class FlightSupervisor:
     def _fail(self, event: str, problem: str) -> None:
         self._result.problems.append(problem)
         self._announce(event, problem)
-
-    def _announce(self, event: str, text: str, **fields: Any) -> None:
-        self._services.log.write(event, text=text, **fields)
-        self._display.print_line(text)
 
     def _is_first(self, what: str) -> bool:
         if what in self._reported:

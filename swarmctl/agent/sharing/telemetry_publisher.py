@@ -58,7 +58,7 @@ class TelemetryPublisher:
         self.failed_plans = 0
         self.active_alert: Alert | None = None
 
-    def publish(
+    def record(
         self,
         now_us: int,
         state: VehicleState | None,
@@ -70,52 +70,8 @@ class TelemetryPublisher:
         deadline_misses: int,
         timing: TickTiming,
     ) -> TickRecord:
-        """Record and publish one tick; the setpoint has been sent before."""
+        """Return the record of one tick; the setpoint has been sent before."""
         self.seq += 1
-        record = self._record(
-            now_us,
-            state,
-            planning,
-            output,
-            mission=mission,
-            estimate=estimate,
-            deadline_misses=deadline_misses,
-            timing=timing,
-        )
-        self._recent_ms.append(timing.tick_ms)
-        row = tick_row(record)
-        self._sink.tick(row, record.flown)
-        self._bus.publish(topics.TICK, pack_tick(row, record.flown))
-        if now_us - self._status_us >= _STATUS_EVERY_US:
-            self._status_us = now_us
-            self._bus.publish(topics.STATUS, encode_message(self._status(record, mission)))
-        return record
-
-    def answer(self, answer: Answer) -> None:
-        """Answer an operator's order."""
-        message = AnswerMessage(
-            agent=self._agent,
-            boot_id=self._boot_id,
-            verb=answer.verb,
-            number=answer.number,
-            accepted=answer.accepted,
-            reason=answer.reason[:MAX_REASON],
-            utc_us=self._clock.utc_us(),
-        )
-        self._bus.publish(topics.ANSWER, encode_message(message))
-
-    def _record(
-        self,
-        now_us: int,
-        state: VehicleState | None,
-        planning: PlanningResult,
-        output: ControlOutput,
-        *,
-        mission: MissionState,
-        estimate: Estimate,
-        deadline_misses: int,
-        timing: TickTiming,
-    ) -> TickRecord:
         utc_us, battery_01 = self._clock.utc_us(), self._autopilot.health.battery_01
         peers, obstacles, age_ms = self._distances(planning, utc_us)
         return TickRecord(
@@ -144,6 +100,29 @@ class TelemetryPublisher:
             battery_01=math.nan if battery_01 is None else battery_01,
             timing=timing,
         )
+
+    def publish(self, record: TickRecord, mission: MissionState) -> None:
+        """Hand a record to the sink and the bus, and a status where one is due."""
+        self._recent_ms.append(record.timing.tick_ms)
+        row = tick_row(record)
+        self._sink.tick(row, record.flown)
+        self._bus.publish(topics.TICK, pack_tick(row, record.flown))
+        if record.t_us - self._status_us >= _STATUS_EVERY_US:
+            self._status_us = record.t_us
+            self._bus.publish(topics.STATUS, encode_message(self._status(record, mission)))
+
+    def answer(self, answer: Answer) -> None:
+        """Answer an operator's order."""
+        message = AnswerMessage(
+            agent=self._agent,
+            boot_id=self._boot_id,
+            verb=answer.verb,
+            number=answer.number,
+            accepted=answer.accepted,
+            reason=answer.reason[:MAX_REASON],
+            utc_us=self._clock.utc_us(),
+        )
+        self._bus.publish(topics.ANSWER, encode_message(message))
 
     def _distances(self, planning: PlanningResult, utc_us: int) -> tuple[list[float], list[float], float]:
         """Return distances to peers and visible obstacles [m] when the setpoint acts, and the largest staleness [ms].

@@ -56,7 +56,7 @@ def station(
     from swarmctl.config import load
     from swarmctl.ops.launch import LaunchOptions
     from swarmctl.ops.station import run_station
-    from swarmctl.telemetry.view.recordings import has_display
+    from swarmctl.telemetry.view.recordings import wants_window
 
-    options = LaunchOptions(run_dir, has_display() and not web if view is None else view, web)
+    options = LaunchOptions(run_dir, wants_window(view, web=web), web)
     return run_station(load(config, sets or (), only_agents=()), options)

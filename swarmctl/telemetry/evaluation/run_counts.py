@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.bus.silence import REOPENED
 from swarmctl.core.types import Array, Mode, PlanStatus
 from swarmctl.telemetry.evaluation.reception import unresponsive
-from swarmctl.telemetry.evaluation.tracks import (
-    flight_rows,
-)
+from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.json_safe import finite
 
 _CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
@@ -47,7 +46,7 @@ def communication(
         "rejected": _refused(events, "bus_summary", "rejected"),
         "refused_frames": _refused(events, "link_summary", "refused"),
         "unresponsive": unresponsive(events, time_field),
-        "reopened": sum(event.get("event") == "bus_reopened" for event in events),
+        "reopened": sum(event.get("event") == REOPENED for event in events),
     }
 
 
@@ -87,13 +86,13 @@ def deadlock_counts(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def commitment_counts(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """Sums over agents of what they counted by their last `commitments` event; None where nothing was guaranteed."""
-    last = {event.get("source"): event for event in events if event.get("event") == "commitments"}
+    last = list(_last_of_each_source(events, "commitments"))
     if not last:
         return None
     names = ("proposed", "committed", "withdrawn", "expired", "unplanned", "evasive")
-    worst_m = max(finite(event.get("worst_tracking_m")) or 0.0 for event in last.values())
+    worst_m = max(finite(event.get("worst_tracking_m")) or 0.0 for event in last)
     off = sum(event.get("event") == "tracking_violation" and event.get("begins") is True for event in events)
-    return {name: sum(int(finite(event.get(name)) or 0) for event in last.values()) for name in names} | {
+    return {name: sum(int(finite(event.get(name)) or 0) for event in last) for name in names} | {
         "worst_tracking_m": worst_m,
         "tracking_violation": off,
     }

@@ -42,6 +42,11 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
+def wants_window(view: bool | None, *, web: bool) -> bool:
+    """Return whether to open a window: as asked, else where there is a display and no page is served instead."""
+    return (has_display() and not web) if view is None else view
+
+
 def open_viewer(target: str, log: Path | None = None) -> subprocess.Popen[bytes]:
     """Open a live URL or a recording in the native viewer, which outlives this process.
 

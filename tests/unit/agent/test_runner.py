@@ -9,7 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from swarmctl.agent.runner import Pace, SessionWatch, StopOrder, _check_vehicle_silence
+from swarmctl.agent.runner import Pace, StopOrder, _check_vehicle_silence
+from swarmctl.bus.silence import SessionWatch
 from swarmctl.config import load
 from swarmctl.core.operator_verbs import Order
 from swarmctl.errors import MissionError, StartError

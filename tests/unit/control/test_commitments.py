@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -137,6 +139,20 @@ def along(corners: Array) -> Sampled:
     return sample
 
 
+def posts(north_m: float, easts_m: Sequence[float], steps: int) -> list[KeepOut]:
+    """Return a wall of posts that nobody moves, known for so many steps of a plan."""
+    return [
+        builders.keep_out(
+            pos_ned_m=np.tile([north_m, east_m, -2.0], (steps + 1, 1)),
+            radius_m=0.375,
+            hard_min_distance_m=0.275,
+            any_height=True,
+            priority_id=-1,
+        )
+        for east_m in easts_m
+    ]
+
+
 @pytest.mark.parametrize(("follows_path", "passes"), [(True, True), (False, False)])
 def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes: bool) -> None:
     """The last plan leads north before a wall, the path south through a gap: rows of one exclude the other."""
@@ -144,17 +160,7 @@ def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes:
     agent = committing(0, max_keep_outs=5, separation=small)
     to_north = quintic_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, accel_m_s2=1.0)
     agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), brake_m_s2=1.5)
-    posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
-    wall = [
-        builders.keep_out(
-            pos_ned_m=np.tile(post, (agent.steps + 1, 1)),
-            radius_m=0.375,
-            hard_min_distance_m=0.275,
-            any_height=True,
-            priority_id=-1,
-        )
-        for post in posts
-    ]
+    wall = posts(0.8, (0.3, 0.6, 0.9, 1.2), agent.steps)
     path = along(np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]]))
     agent.propose(
         builders.situation(
@@ -178,17 +184,7 @@ def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: py
     agent = committing(0, max_keep_outs=3, separation=small)
     here = np.array([2.716, 2.764, -2.0])
     agent.begin(here, np.zeros(3), UTC_US)
-    posts = [np.array([3.0, y_m, -2.0]) for y_m in (2.802, 2.502, 2.202)]
-    wall = [
-        builders.keep_out(
-            pos_ned_m=np.tile(post, (agent.steps + 1, 1)),
-            radius_m=0.375,
-            hard_min_distance_m=0.275,
-            any_height=True,
-            priority_id=-1,
-        )
-        for post in posts
-    ]
+    wall = posts(3.0, (2.802, 2.502, 2.202), agent.steps)
     path = along(np.array([here[:2], [2.77, 3.14], [3.21, 3.25], [4.19, 3.06]]))
     agent.propose(
         builders.situation(

@@ -24,6 +24,20 @@ def same_gain(steps: int, axes: int) -> Array:
     return np.full((steps, axes), GAIN)
 
 
+def from_rest(ref_pos_m: Array) -> AxesProblem:
+    """From rest at the origin to a reference (Hp, 2) that stands still."""
+    origin = np.zeros(2)
+    return AxesProblem(
+        pos_m=origin,
+        vel_m_s=origin,
+        u_prev=origin,
+        gain_m_s2=same_gain(*ref_pos_m.shape),
+        drift_m_s2=origin,
+        ref_pos_m=ref_pos_m,
+        ref_vel_m_s=np.zeros_like(ref_pos_m),
+    )
+
+
 def dense(
     problem: CondensedMpc,
     pos: Array,
@@ -137,19 +151,10 @@ def test_rows_are_at_the_end_of_the_horizon_and_none_before_it_can_be_influenced
 
 def test_rows_that_cannot_be_met_give_slack_and_not_failure() -> None:
     problem = mpc(AXIS, AXIS, max_keep_outs=2, qp=QpParams())
-    still, origin = np.zeros((40, 2)), np.zeros(2)
     north, south = wall((1.0, 0.0), 0.1, 40), wall((-1.0, 0.0), 0.1, 40)  # north of 0.1 m and south of -0.1 m
     both = HalfSpaces(**{name: np.concatenate([getattr(w, name) for w in (north, south)]) for name in FIELDS})
     solution = problem.solve(
-        AxesProblem(
-            pos_m=origin,
-            vel_m_s=origin,
-            u_prev=origin,
-            gain_m_s2=same_gain(40, 2),
-            drift_m_s2=origin,
-            ref_pos_m=still,
-            ref_vel_m_s=still,
-        ),
+        from_rest(np.zeros((40, 2))),
         both,
     )
     assert solution.solved
@@ -161,18 +166,10 @@ def test_rows_that_cannot_be_met_give_slack_and_not_failure() -> None:
 @pytest.mark.parametrize("ref_m", [1.0, 10.0, 50.0])
 def test_no_reference_is_worth_any_slack_where_the_rows_can_be_met(ref_m: float) -> None:
     problem = mpc(AXIS, AXIS, max_keep_outs=1, qp=QpParams())
-    origin, reference = np.zeros(2), np.tile([ref_m, 0.0], (40, 1))
+    reference = np.tile([ref_m, 0.0], (40, 1))
     spaces = wall((-1.0, 0.0), -0.1, 40)  # stay south of 0.1 m
     solution = problem.solve(
-        AxesProblem(
-            pos_m=origin,
-            vel_m_s=origin,
-            u_prev=origin,
-            gain_m_s2=same_gain(40, 2),
-            drift_m_s2=origin,
-            ref_pos_m=reference,
-            ref_vel_m_s=0.0 * reference,
-        ),
+        from_rest(reference),
         spaces,
     )
     assert solution.slack_m < 0.005
@@ -181,18 +178,9 @@ def test_no_reference_is_worth_any_slack_where_the_rows_can_be_met(ref_m: float)
 
 def test_relaxed_rows_ask_for_no_more_than_can_be_reached() -> None:
     problem = mpc(AXIS, AXIS, max_keep_outs=1, relax_01=0.9, qp=QpParams())
-    still, origin = np.zeros((40, 2)), np.zeros(2)
     spaces = wall((1.0, 0.0), 2.0, 40)
     solution = problem.solve(
-        AxesProblem(
-            pos_m=origin,
-            vel_m_s=origin,
-            u_prev=origin,
-            gain_m_s2=same_gain(40, 2),
-            drift_m_s2=origin,
-            ref_pos_m=still,
-            ref_vel_m_s=still,
-        ),
+        from_rest(np.zeros((40, 2))),
         spaces,
     )
     assert solution.slack_m < 0.02

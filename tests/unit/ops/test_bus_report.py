@@ -9,9 +9,10 @@ from typing import Any
 from swarmctl.bus.json_messages import encode_message
 from swarmctl.bus.peers import Bus, LocalHub
 from swarmctl.bus.refusals import FORGED, IDENTITY, MALFORMED, REPLAYED, RefusedMessage
+from swarmctl.bus.silence import REOPENED
 from swarmctl.bus.topics import STATUS
 from swarmctl.bus.traffic import CountedBus
-from swarmctl.ops.bus_report import REOPENED, BusReport
+from swarmctl.ops.bus_report import BusReport
 from swarmctl.ops.status_table import AgentView
 from tests import builders
 
