@@ -140,7 +140,7 @@ class SimulatorParams(Params):
     start: Literal["ground", "air"] = "ground"  # air: vehicles begin at their start positions, without ground (thesis)
     ekf_ready_s: float = Field(1.0, ge=0, le=60)  # from power-up until arming is possible; 4 in PX4
     mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
-    estimator: Literal["exact", "gps", "external"] = "exact"  # error model of the autopilots' estimates
+    estimator: Literal["exact", "gps", "external", "px4_gps", "px4_external"] = "exact"  # errors of their estimates
     autopilot_kind: Literal["px4", "arducopter"] = "px4"  # autopilot whose MAVLink interface is simulated
     physics_hz: int = Field(250, ge=50, le=1000)  # integration steps per second
     gcs_port: int = Field(0, ge=0, le=65535)  # ground station, with a second link to every vehicle; 0: none

@@ -19,7 +19,8 @@ from sitl.plant.sensors import FULL, Estimate, Power
 from sitl.plant.vehicle import Array, Plant
 
 _BLOCK = 50  # steps of random numbers drawn at a time
-_DRAWS = 17  # per step and vehicle: wander of position 3, velocity 3, tilt 2; white noise on each 3, 3, 3
+_WHITE = 9  # random numbers per step and vehicle for the white noise on position, velocity and attitude
+_TILT, _FAST = slice(6, 8), slice(8, 14)  # of what wanders
 _PURPOSE = 1  # purpose of the random stream, beside run seed and vehicle
 _LOST_M_S2 = 0.05  # acceleration that a tilt error of 0.3 deg causes in an uncorrected position
 EXACT_ACCURACY_M = (0.01, 0.01)
@@ -49,10 +50,11 @@ _SUMS = np.array(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorModel:
-    """Slow errors: root mean square and correlation time, NED per axis.
+    """Slow and fast errors: root mean square and correlation time, NED per axis.
 
     They are white noise behind two equal low-passes. A filter that integrates inertial data, as an autopilot's does,
-    has smooth errors, so that its position can still be differentiated.
+    has smooth errors, so that its position can still be differentiated. Slow ones are its drift between fixes. Fast
+    ones (0.1 to 1.5 Hz) come from its accelerometers, and are what a controller follows.
     """
 
     position_m: tuple[float, float, float]
@@ -65,11 +67,27 @@ class ErrorModel:
     noise_velocity_m_s: float
     noise_attitude_rad: float
     latency_s: tuple[float, float]  # age of a sample when published; drawn for each vehicle from this interval
+    fast_position_m: tuple[float, float, float] = (0.0,) * 3
+    fast_position_tau_s: float = 1.0
+    fast_velocity_m_s: tuple[float, float, float] = (0.0,) * 3
+    fast_velocity_tau_s: float = 1.0
+
+    @property
+    def wander(self) -> Array:
+        """RMS and correlation time [s] of what wanders, (2, 8): position, velocity, tilt; (2, 14) with fast ones."""
+        rows = [*zip(self.position_m, (self.position_tau_s,) * 3, strict=True)]
+        rows += zip(self.velocity_m_s, (self.velocity_tau_s,) * 3, strict=True)
+        rows += [(self.tilt_rad, self.tilt_tau_s)] * 2
+        if any((*self.fast_position_m, *self.fast_velocity_m_s)):
+            rows += zip(self.fast_position_m, (self.fast_position_tau_s,) * 3, strict=True)
+            rows += zip(self.fast_velocity_m_s, (self.fast_velocity_tau_s,) * 3, strict=True)
+        return np.array(rows).T
 
     @property
     def accuracy_m(self) -> tuple[float, float]:
         """Accuracy [m], 1 sigma, horizontal (both axes together, as PX4 reports it) and vertical."""
-        north, east, down = (math.hypot(rms_m, self.noise_position_m) for rms_m in self.position_m)
+        pairs = zip(self.position_m, self.fast_position_m, strict=True)
+        north, east, down = (math.hypot(slow_m, fast_m, self.noise_position_m) for slow_m, fast_m in pairs)
         return math.hypot(north, east), down
 
 
@@ -88,7 +106,7 @@ _PERFECT = ErrorModel(
 
 ESTIMATORS: dict[str, ErrorModel | None] = {
     "exact": None,
-    "gps": ErrorModel(  # PX4 1.18 with its default GPS: position 0.3-0.6 m off in space, velocity 0.1-0.3 m/s
+    "gps": ErrorModel(  # slow errors of PX4 with its default GPS: position 0.3-0.6 m off in space, velocity 0.1-0.3 m/s
         position_m=(0.2, 0.2, 0.25),
         position_tau_s=25.0,
         velocity_m_s=(0.15, 0.15, 0.15),
@@ -109,6 +127,38 @@ ESTIMATORS: dict[str, ErrorModel | None] = {
         tilt_tau_s=20.0,
         noise_position_m=0.005,
         noise_velocity_m_s=0.02,
+        noise_attitude_rad=math.radians(0.1),
+        latency_s=(0.010, 0.020),
+    ),
+    "px4_gps": ErrorModel(  # slow and fast, fitted to logs of PX4 1.18 beside the truth of its simulator
+        position_m=(0.12, 0.25, 0.3),
+        position_tau_s=10.0,
+        velocity_m_s=(0.14, 0.3, 0.14),
+        velocity_tau_s=5.0,
+        fast_position_m=(0.03, 0.03, 0.02),
+        fast_position_tau_s=1.2,
+        fast_velocity_m_s=(0.03, 0.07, 0.045),
+        fast_velocity_tau_s=0.5,
+        tilt_rad=math.radians(0.3),
+        tilt_tau_s=20.0,
+        noise_position_m=0.0012,
+        noise_velocity_m_s=0.006,
+        noise_attitude_rad=math.radians(0.1),
+        latency_s=(0.010, 0.020),
+    ),
+    "px4_external": ErrorModel(  # the same, position fed at 50 Hz into a PX4 set up for it: 2 cm off
+        position_m=(0.006, 0.015, 0.005),
+        position_tau_s=10.0,
+        velocity_m_s=(0.03, 0.03, 0.012),
+        velocity_tau_s=5.0,
+        fast_position_m=(0.005, 0.014, 0.011),
+        fast_position_tau_s=0.5,
+        fast_velocity_m_s=(0.025, 0.085, 0.055),
+        fast_velocity_tau_s=0.5,
+        tilt_rad=math.radians(0.3),
+        tilt_tau_s=20.0,
+        noise_position_m=0.0012,
+        noise_velocity_m_s=0.006,
         noise_attitude_rad=math.radians(0.1),
         latency_s=(0.010, 0.020),
     ),
@@ -147,8 +197,7 @@ class Estimator:
     def _start(self, model: ErrorModel, plant: Plant, seed: int) -> None:
         count, dt_s = plant.state.shape[1], plant.dt_s
         self._rngs = [np.random.default_rng([seed, i, _PURPOSE]) for i in range(count)]
-        taus_s = np.repeat([model.position_tau_s, model.velocity_tau_s, model.tilt_tau_s], (3, 3, 2))
-        rms = np.array([*model.position_m, *model.velocity_m_s, model.tilt_rad, model.tilt_rad])
+        rms, taus_s = model.wander
         self._keep = np.exp(-2.0 * dt_s / taus_s)[:, None]  # of each low-pass, with half the correlation time
         self._follow = 1.0 - self._keep
         rough_rms = math.sqrt(2.0) * rms  # of the first stage: the second halves its variance
@@ -156,16 +205,17 @@ class Estimator:
         self._white_rms = np.repeat(
             [model.noise_position_m, model.noise_velocity_m_s, model.noise_attitude_rad], (3, 3, 3)
         )[:, None]
-        first = np.stack([rng.standard_normal((2, 8)) for rng in self._rngs], axis=2)  # (2, 8, N)
+        wanders = len(rms)
+        first = np.stack([rng.standard_normal((2, wanders)) for rng in self._rngs], axis=2)  # (2, wanders, N)
         self._wander = first[0] * rms[:, None]
         self._rough = self._wander + first[1] * rms[:, None]  # stationary variance and correlation of the two
         low_s, high_s = model.latency_s
         self._start_history(np.array([round(rng.uniform(low_s, high_s) / dt_s) for rng in self._rngs]))
-        self._driven = np.zeros((0, 8, count))  # of each step of a block: what drives the wander, white noise
-        self._noise = np.zeros((0, 9, count))
+        self._driven = np.zeros((0, wanders, count))  # of each step of a block: what drives the wander, white noise
+        self._noise = np.zeros((0, _WHITE, count))
         self._drawn = 0
-        self._white = np.zeros((9, count))
-        self._lead = np.zeros((8, count))  # of the first stage over the second
+        self._white = np.zeros((_WHITE, count))
+        self._lead = np.zeros((wanders, count))  # of the first stage over the second
         self._tilt_rad = np.zeros((3, count))
         self._believed = np.zeros((_KNOWN_ROWS, count))
         self._tilt_quat()
@@ -202,8 +252,9 @@ class Estimator:
 
     def _draw(self) -> None:
         """Draw the random numbers of a block of steps."""
-        draws = np.stack([rng.standard_normal((_BLOCK, _DRAWS)) for rng in self._rngs], axis=2)
-        self._driven, self._noise = self._drive * draws[:, :8], draws[:, 8:] * self._white_rms
+        wanders = len(self._wander)
+        draws = np.stack([rng.standard_normal((_BLOCK, wanders + _WHITE)) for rng in self._rngs], axis=2)
+        self._driven, self._noise = self._drive * draws[:, :wanders], draws[:, wanders:] * self._white_rms
         self._drawn = 0
 
     def of(self, vehicle: int, t_us: int) -> Estimate:
@@ -289,7 +340,7 @@ class Estimator:
 
     def _tilt_quat(self) -> None:
         """Update the attitude that the attitude loop uses."""
-        self._tilt_rad[:2] = self._wander[6:]
+        self._tilt_rad[:2] = self._wander[_TILT]
         self.q_nb = _turned(self._plant.q_nb, self._tilt_rad)
 
     def _publish(self) -> None:
@@ -309,6 +360,8 @@ class Estimator:
         believed = self._believed
         self._history.take(self._delayed[self._head], out=believed[_SAMPLE], mode="clip")
         believed[_MOTION] += self._wander[:6] + self._white[:6]
+        if len(self._wander) > _FAST.start:
+            believed[_MOTION] += self._wander[_FAST]
         if self._displaced:
             believed[10:13] += self._jump_ned_m + self._drift_axis * (0.5 * _LOST_M_S2 * self._lost_s**2)
             believed[13:16] += self._drift_axis * (_LOST_M_S2 * self._lost_s)

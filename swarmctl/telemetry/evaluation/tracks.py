@@ -51,8 +51,13 @@ def flight_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
 
 def tracking_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
     """Return the ticks of the mission itself."""
-    during: NDArray[np.void] = rows[(rows["phase"] == Phase.TRACK) & (np.abs(rows["mission_t_s"]) < MAX_RUN_US / 1e6)]
+    during: NDArray[np.void] = rows[_is_tracking(rows)]
     return during
+
+
+def _is_tracking(rows: NDArray[np.void]) -> NDArray[np.bool_]:
+    tracking: NDArray[np.bool_] = (rows["phase"] == Phase.TRACK) & (np.abs(rows["mission_t_s"]) < MAX_RUN_US / 1e6)
+    return tracking
 
 
 def missions(rows: NDArray[np.void]) -> list[NDArray[np.void]]:
@@ -136,8 +141,7 @@ def _reported_tracks(ticks: Mapping[int, NDArray[np.void]], agents: int) -> Trac
     t_us = np.arange(first_us, last_us + 1, _GRID_US)
     pos_ned_m = np.full((len(t_us), agents, 3), np.nan)
     for agent, rows in known.items():
-        of_us, newest = np.unique(_state_utc_us(rows), return_index=True)
-        pos_ned_m[:, agent] = interpolate(t_us, of_us, rows["pos_ned_m"][newest], _GAP_US)
+        pos_ned_m[:, agent] = _reported_positions(rows, "utc_us", t_us)
     return Tracks(t_us.astype(np.float64), pos_ned_m, "utc_us")
 
 
@@ -147,11 +151,15 @@ def _located(rows: NDArray[np.void]) -> NDArray[np.bool_]:
     return located
 
 
-def _state_utc_us(rows: NDArray[np.void]) -> NDArray[np.int64]:
-    """Return the UTC (T,) [us] of the recorded states, for ticks with a state."""
-    age_us = np.clip(rows["state_age_ms"].astype(np.float64) * 1e3, 0.0, MAX_RUN_US)
-    when_us: NDArray[np.int64] = rows["utc_us"] - np.round(age_us).astype(np.int64)
-    return when_us
+def _reported_positions(rows: NDArray[np.void], time_field: str, at_us: NDArray[np.int64]) -> Array:
+    """Return the reported positions (T, 3) at instants (T,); each report counts at the time of its state.
+
+    At 5 m/s the 10 ms that a state is old at a tick, on average, are 5 cm.
+    """
+    located = rows[_located(rows)]
+    age_us = np.clip(located["state_age_ms"].astype(np.float64) * 1e3, 0.0, MAX_RUN_US)
+    of_us, newest = np.unique(located[time_field] - np.round(age_us).astype(np.int64), return_index=True)
+    return interpolate(at_us, of_us, located["pos_ned_m"][newest], _GAP_US)
 
 
 def unseen_spans(rows: NDArray[np.void], time_field: str) -> list[tuple[float, float]]:
@@ -177,10 +185,9 @@ def interpolate(at_us: NDArray[np.int64], t_us: NDArray[np.int64], values: Array
 
 
 def true_positions(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) -> Array:
-    """Return positions (T, 3) of an agent's vehicle at each tick: interpolated truth, else its report; else NaN."""
+    """Return positions (T, 3) of an agent's vehicle at each tick: of the truth, else of its reports; else NaN."""
     if not len(truth):
-        heard = _located(rows) & (rows["state_age_ms"] <= _STALE_MS)
-        return np.where(heard[:, None], rows["pos_ned_m"], np.nan)
+        return _reported_positions(rows, "t_us", rows["t_us"])
     own = truth[truth["vehicle"] == agent]
     return interpolate(rows["t_us"], own["t_us"], own["pos_ned_m"], _GAP_US)
 
@@ -212,8 +219,9 @@ def _apart_01(rows: NDArray[np.void], others: NDArray[np.void]) -> float:
 
 def track_error(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) -> TrackError:
     """Return the tracking error of one agent at each tick of the mission with known position and reference."""
-    tracking = tracking_rows(rows)
-    error_ned_m = true_positions(tracking, truth, agent) - tracking["ref_pos_ned_m"]
+    during = _is_tracking(rows)
+    tracking = rows[during]
+    error_ned_m = true_positions(rows, truth, agent)[during] - tracking["ref_pos_ned_m"]
     known = np.isfinite(error_ned_m).all(axis=1)
     error_ned_m = error_ned_m[known]
     return TrackError(

@@ -346,6 +346,16 @@ def test_a_reported_state_counts_at_its_own_time() -> None:
     assert pair["min_at_s"] == pytest.approx(9.8, abs=0.03)
 
 
+@pytest.mark.parametrize(("age_ms", "error_m"), [(0.0, 0.05), (10.0, 0.0)])
+def test_a_reported_state_is_compared_with_the_reference_of_its_own_time(age_ms: float, error_m: float) -> None:
+    rows = ticks(20, (0.0, 0.0, 0.0))
+    rows["ref_pos_ned_m"][:, 0] = 5.0 * rows["mission_t_s"]
+    rows["pos_ned_m"][:, 0] = 5.0 * (rows["mission_t_s"] - 0.01)
+    rows["state_age_ms"] = age_ms
+    tracking = evaluate(run({0: rows}), Rules(agents=1, required_separation_m=0.5), "completed")["tracking"]
+    assert tracking["index_after_10s_m"] == pytest.approx(error_m, abs=1e-4)
+
+
 def test_clocks_of_different_years_have_no_common_instants() -> None:
     other = ticks(10, (5.0, 0.0, 0.0))
     other["utc_us"] -= UTC0_US
