@@ -92,6 +92,21 @@ def test_external_position_is_ten_times_better() -> None:
     assert 0.03 <= rms(smoothed(flown["vel"], 1.0)) <= 0.1
 
 
+def banded_rms(values: Any, low_hz: float, high_hz: float) -> Any:
+    """RMS (3,) per axis between two frequencies, over all vehicles; values (T, N, 3)."""
+    spectrum = np.fft.rfft(values - values.mean(axis=0), axis=0)
+    hz = np.fft.rfftfreq(len(values), 1.0 / HZ)
+    spectrum[(hz < low_hz) | (hz > high_hz)] = 0.0
+    return np.sqrt(np.mean(np.fft.irfft(spectrum, len(values), axis=0) ** 2, axis=(0, 1)))
+
+
+@pytest.mark.parametrize("slow", ["gps", "external"])
+def test_px4s_velocity_errs_faster_than_the_slow_models(slow: str) -> None:
+    fast_m_s, slow_m_s = (banded_rms(still(name)["vel"], 0.3, 1.5) for name in (f"px4_{slow}", slow))
+    assert (fast_m_s >= 0.015).all() and (fast_m_s <= 0.065).all(), "of PX4's logs beside the truth of its simulator"
+    assert (fast_m_s >= 1.4 * slow_m_s).all()
+
+
 def test_vehicles_err_independently_and_each_the_same_in_any_swarm(gps: dict[str, Any]) -> None:
     few = still("gps", vehicles=2, seconds=2)
     assert np.allclose(few["pos"], gps["pos"][: 2 * HZ, :2], atol=0.02), "rounded origins differ by some mm"
