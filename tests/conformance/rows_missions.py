@@ -97,7 +97,8 @@ def upload(items: tuple[Item, ...], kind: int = 0) -> tuple[Step, ...]:
 
 
 def download(items: tuple[Item, ...]) -> tuple[Step, ...]:
-    steps: list[Step] = [addressed("MISSION_REQUEST_LIST"), sees("MISSION_COUNT", count=len(items), mission_type=0)]
+    steps: list[Step] = [Wait(0.3)]  # PX4 acknowledges a list before its navigator has told how long it is
+    steps += [addressed("MISSION_REQUEST_LIST"), sees("MISSION_COUNT", count=len(items), mission_type=0)]
     for seq, what in enumerate(items):
         steps += [
             addressed("MISSION_REQUEST_INT", seq=seq),
