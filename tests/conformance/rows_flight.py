@@ -168,12 +168,12 @@ RESPONSE_ROWS = (
     step_response(
         "roll",
         10.0,
-        {"10": Between(0.11, 0.165), "50": Between(0.24, 0.30), "63": Between(0.28, 0.34), "90": Between(0.43, 0.54)},
+        {"10": Between(0.1, 0.155), "50": Between(0.225, 0.285), "63": Between(0.265, 0.325), "90": Between(0.4, 0.51)},
         Between(9.8, 10.5),
         1.0,
     ),
-    step_response("pitch", 10.0, {"63": Between(0.28, 0.34), "90": Between(0.43, 0.54)}, Between(9.8, 10.5), 1.0),
-    step_response("roll", 30.0, {"63": Between(0.28, 0.34), "90": Between(0.43, 0.52)}, Between(28.8, 31.0), 1.0),
+    step_response("pitch", 10.0, {"63": Between(0.265, 0.325), "90": Between(0.40, 0.51)}, Between(9.8, 10.5), 1.0),
+    step_response("roll", 30.0, {"63": Between(0.27, 0.33), "90": Between(0.41, 0.50)}, Between(28.8, 31.0), 1.0),
     step_response("yaw", 20.0, {"50": Between(0.50, 0.63), "90": Between(0.73, 0.86)}, Between(24.5, 26.8), 1.5),
     Row(
         name="hover thrust in LOITER",
