@@ -246,7 +246,8 @@ RUN_ROWS = (
                 as_int=True,
             ),
             mode(M_LOITER),
-            sees("LOCAL_POSITION_NED", 15.0, x=near(8.0, 0.8), y=near(0.0, 0.8), z=near(-6.0, 0.8)),
+            # The height is above sea level, and the vehicle's origin as high as its GPS said when it started.
+            sees("LOCAL_POSITION_NED", 15.0, x=near(8.0, 0.8), y=near(0.0, 0.8), z=near(-6.0, 1.6)),
         ),
     ),
 )
