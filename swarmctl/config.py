@@ -47,6 +47,7 @@ from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.feasibility import FlightLimits, infeasible
+from swarmctl.control.reference.kind import Place
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.obstacle import Obstacle
@@ -114,6 +115,18 @@ class Config(Params):
         x, y, z = self.start.center_ned_m
         return tuple((x + o * unit[0], y + o * unit[1], z + o * unit[2]) for o in offsets)
 
+    def goals_ned_m(self) -> tuple[tuple[float, ...] | None, ...]:
+        """Return where the mission takes every agent, shared NED [m]; None where it is flown for its way.
+
+        Nothing of a mission of somebody else's code is known, as it is not run here, nor of one that can't be flown.
+        """
+        starts_ned_m, agents = np.array(self.starts_ned_m()), self.swarm.agents
+        if self.mission.is_own or len(starts_ned_m) < agents or any(self.mission.problems(agents)):
+            return (None,) * agents
+        flown, apart_m = self.mission.flown(), self.separation.budget.planned_m
+        places = (Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m) for agent in range(agents))
+        return tuple(None if goal is None else tuple(goal.pos_ned_m.tolist()) for goal in map(flown.goal, places))
+
     def sysids(self) -> tuple[int, ...]:
         """Return the MAVLink system id of every agent's vehicle."""
         if self.vehicles:
@@ -163,6 +176,7 @@ class Config(Params):
             duration_s=self.mission.duration_s,
             downwash=self.separation.downwash,
             volume=self.volume.flight_volume(),
+            goals_ned_m=self.goals_ned_m(),
         )
 
 

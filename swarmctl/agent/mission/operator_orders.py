@@ -50,7 +50,11 @@ class OperatorOrders:
         self._ports.note("operator", verb=order.verb, **order.arguments)
         offered = self._state_machine.mission.offered
         if order.verb == MISSION and offered is not None:
-            self._ports.note("mission_changed", duration_s=offered.duration_s, mission=offered.text)
+            goal = offered.reference.goal
+            pos_ned_m = None if goal is None else goal.pos_ned_m.tolist()
+            self._ports.note(
+                "mission_changed", duration_s=offered.duration_s, mission=offered.text, goal_ned_m=pos_ned_m
+            )
         return ""
 
     def _refusal(self, order: Order, now_us: int) -> str:

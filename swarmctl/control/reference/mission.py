@@ -111,11 +111,13 @@ class MissionReference:
 
     Attributes:
         offset_ned_m: own place (3,) around a reference that several share; the error of tracking is that to the latter.
+        goal: where the agent is meant to arrive; None of a mission that is flown for its way, or somebody else's.
     """
 
     def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int, apart_m: float = 0.0) -> None:
         self._mission, self._start_ned_m, self._yaw_rad = params.flown(), starts_ned_m[agent], params.yaw_rad
         place = Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m)
+        self.goal = None if params.is_own else self._mission.goal(place)
         if params.is_own:
             self._sampled, self._heading, self.offset_ned_m = _tabulated(self._mission, place, params)
         else:

@@ -12,6 +12,7 @@ from pydantic import Field
 from swarmctl.control.reference.goal_assignment import assigned_goals_ned_m
 from swarmctl.control.reference.kind import MissionKind, Place, mission_kind
 from swarmctl.control.reference.quintic import QuinticTrajectory, quintic_to
+from swarmctl.core.goal import Goal
 from swarmctl.core.params import Vec3
 from swarmctl.core.types import Sampled
 
@@ -33,13 +34,20 @@ class GotoParams(MissionKind):
         return False
 
     def reference(self, place: Place) -> Sampled:
-        starts = tuple(map(tuple, place.starts_ned_m.tolist()))
-        return _goal_flights(self, starts, place.apart_m, OUTER_DELAY_S_M)[place.agent].sample
+        return self._flight(place).sample
+
+    def goal(self, place: Place) -> Goal | None:
+        flight = self._flight(place)
+        return Goal(pos_ned_m=flight.to_ned_m, needs_s=flight.travel_s)
 
     def problems(self, agents: int) -> Iterator[str]:
         goals = len(self.goals_ned_m)
         if goals not in (1, agents):
             yield f"mission.goto.goals_ned_m: {goals} goals for swarm.agents = {agents}; list one each, or one for all"
+
+    def _flight(self, place: Place) -> QuinticTrajectory:
+        starts = tuple(map(tuple, place.starts_ned_m.tolist()))
+        return _goal_flights(self, starts, place.apart_m, OUTER_DELAY_S_M)[place.agent]
 
 
 @lru_cache(maxsize=8)  # the goals of all agents are assigned at once, and each is asked for
