@@ -22,6 +22,7 @@ from swarmctl.bus.network.hosts import HostParams, host_problems, roster_of
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.config_constraints import (
     forward_problems,
+    obstacle_problems,
     own_controller_problems,
     separation_problems,
     simulated_host_problems,
@@ -52,7 +53,7 @@ from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.own import OwnError
-from swarmctl.core.params import Params
+from swarmctl.core.params import FARTHEST_M, Params
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.parameter_names import parameter_problems
@@ -115,14 +116,23 @@ class Config(Params):
         x, y, z = self.start.center_ned_m
         return tuple((x + o * unit[0], y + o * unit[1], z + o * unit[2]) for o in offsets)
 
+    @property
+    def has_references(self) -> bool:
+        """Tell whether every agent has a start, and the mission's keys go together, so that references are known."""
+        listed, line = self.start.positions_ned_m, self.start.direction_ned
+        has_starts = len(listed) >= self.swarm.agents if listed else sum(c * c for c in line) > 0.0
+        near = has_starts and all(abs(c) <= FARTHEST_M for start in self.starts_ned_m() for c in start)
+        return near and not any(self.mission.problems(self.swarm.agents))
+
     def goals_ned_m(self) -> tuple[tuple[float, ...] | None, ...]:
         """Return where the mission takes every agent, shared NED [m]; None where it is flown for its way.
 
         Nothing of a mission of somebody else's code is known, as it is not run here, nor of one that can't be flown.
         """
-        starts_ned_m, agents = np.array(self.starts_ned_m()), self.swarm.agents
-        if self.mission.is_own or len(starts_ned_m) < agents or any(self.mission.problems(agents)):
+        agents = self.swarm.agents
+        if self.mission.is_own or not self.has_references:
             return (None,) * agents
+        starts_ned_m = np.array(self.starts_ned_m())
         flown, apart_m = self.mission.flown(), self.separation.budget.planned_m
         places = (Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m) for agent in range(agents))
         return tuple(None if goal is None else tuple(goal.pos_ned_m.tolist()) for goal in map(flown.goal, places))
@@ -212,7 +222,7 @@ def load(
     config = validated(Config, tree, source, _RENAMED)
     make_importable(config.own_folder)
     problems = list(own_problems(config.mission, config.controller, config.vehicle_model, config.separation))
-    problems = problems or list(_whole(config, only_agents)) or list(_infeasible(config))
+    problems = problems or [*_whole(config, only_agents), *_infeasible(config)]
     if problems:
         raise ConfigError(source, problems)
     return config
@@ -300,6 +310,7 @@ def _start_problems(config: Config) -> Iterator[str]:
         yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
     elif not (listed and listed < agents):
         yield from starts_apart(config.starts_ned_m(), config.separation, config.sitl)
+        yield from obstacle_problems(config.obstacles, config.starts_ned_m(), config.goals_ned_m())
         yield from config.geofence.problems(config.starts_ned_m())
         yield from volume_problems(
             config.volume, config.geofence, config.controller, config.separation, config.starts_ned_m(), config.drift_m
@@ -311,11 +322,14 @@ def _start_problems(config: Config) -> Iterator[str]:
 
 
 def _infeasible(config: Config) -> Iterator[str]:
-    """Yield why the references of a configuration without other problems can't be flown."""
+    """Yield why references can't be flown, as far as other problems let them be known."""
+    if not config.has_references or 0 < len(config.vehicles) < config.swarm.agents:
+        return
     separation = config.separation
+    close = any(starts_apart(config.starts_ned_m(), separation, config.sitl))
     limits = FlightLimits(
         duration_s=config.mission.duration_s,
-        apart_m=separation.radius_m,
+        apart_m=0.0 if close else separation.radius_m,  # what follows from starts is not said again
         downwash=separation.downwash,
         ground_z_m=config.sitl.ground_z_m if config.sitl.enabled else None,
         volume=config.volume.flight_volume(),

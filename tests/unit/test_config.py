@@ -112,6 +112,53 @@ def test_refused_in_one_line_with_key_value_and_what_is_allowed(
     assert "\n" not in text
 
 
+TWO_OBSTACLES = (
+    "obstacles=[{center_ned_m=[4, 0, 0]}, {center_ned_m=[0, 3, 0], column=true, radius_m=0.3, keep_out_m=1.0}]"
+)
+GOTO = "mission.kind=goto"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (("start.center_ned_m=[3, 0, 0]",), "obstacles.0: agent 2 would wait 0.00 m from its centre; its keep_out_m"),
+        (("start.center_ned_m=[0, 2.1, -9]",), "obstacles.1: agent 1 would wait 0.90 m from its axis"),
+        (
+            (GOTO, "mission.goto.goals_ned_m=[[-9, 0, 0], [4, 1.5, 0], [9, 0, 0]]"),
+            "obstacles.0: the goal of agent 1 is 1.50 m from its centre; its keep_out_m is 1.75. Move one of them",
+        ),
+        ((GOTO, "mission.goto.goals_ned_m=[[4, 0, 0]]"), "obstacles.0: the goal of agent 2"),  # places round it
+        (("start.center_ned_m=[1e200, 0, 0]",), "more than 1e+06 m from the shared origin"),
+        ((GOTO, "mission.goto.goals_ned_m=[[1e200, 0, 0]]"), "goals [0] are more than 1e+06 m"),
+    ],
+)
+def test_starts_and_goals_in_obstacles_or_beyond_all_bounds(overrides: tuple[str, ...], words: str) -> None:
+    assert any(words in problem for problem in refusals(None, TWO_OBSTACLES, *overrides))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        (),
+        ("start.center_ned_m=[1.2, 0, 0]",),
+        (GOTO, "mission.goto.goals_ned_m=[[-9, 0, 0], [4, 1.8, 0], [9, 0, 0]]"),
+        (GOTO, "mission.goto.goals_ned_m=[[4, 0, -2]]"),  # above it
+        (GOTO, "mission.goto.goals_ned_m=[[4, 0, 0]]", "obstacles.0.vel_ned_m_s=[0, 1, 0]"),  # not there for long
+    ],
+)
+def test_negative_control_clear_of_obstacles(overrides: tuple[str, ...]) -> None:
+    load(None, (TWO_OBSTACLES, *overrides))
+
+
+def test_problems_of_starts_goals_and_references_are_named_together() -> None:
+    low = "mission.goto.goals_ned_m=[[-9, 0, 3], [4, 0, 0], [9, 0, 0]]"
+    problems = refusals(None, TWO_OBSTACLES, GOTO, low, "start.spacing_m=0.3", "mission.duration_s=6")
+    for words in ("agents 0 and 1 would wait 0.30 m apart", "the goal of agent 1 is", "duration_s = 6", "the ground"):
+        assert any(words in problem for problem in problems), words
+    hover = refusals(None, "mission.kind=hover", "start.spacing_m=0.3")
+    assert all(problem.startswith("start: ") for problem in hover), "what follows from starts is not said again"
+
+
 def test_a_refused_number_of_agents_is_reported_once() -> None:
     assert len(refusals(None, "swarm.agents=0")) == 1
     assert len(refusals(None, "swarm.agents=1000")) == 1

@@ -13,7 +13,7 @@ from swarmctl.control.reference.goal_assignment import assigned_goals_ned_m
 from swarmctl.control.reference.kind import MissionKind, Place, mission_kind
 from swarmctl.control.reference.quintic import QuinticTrajectory, quintic_to
 from swarmctl.core.goal import Goal
-from swarmctl.core.params import Vec3
+from swarmctl.core.params import FARTHEST_M, Vec3
 from swarmctl.core.types import Sampled
 
 OUTER_DELAY_S_M = 0.5  # delay of arrival per metre that a place is farther out
@@ -44,6 +44,9 @@ class GotoParams(MissionKind):
         goals = len(self.goals_ned_m)
         if goals not in (1, agents):
             yield f"mission.goto.goals_ned_m: {goals} goals for swarm.agents = {agents}; list one each, or one for all"
+        far = [i for i, goal in enumerate(self.goals_ned_m) if max(map(abs, goal)) > FARTHEST_M]
+        if far:
+            yield f"mission.goto.goals_ned_m: goals {far} are more than {FARTHEST_M:g} m from the shared origin"
 
     def _flight(self, place: Place) -> QuinticTrajectory:
         starts = tuple(map(tuple, place.starts_ned_m.tolist()))
