@@ -245,9 +245,10 @@ def load_mission(config: Config, path: Path) -> MissionParams:
     if changed.mission.is_own:
         own = "is somebody else's code, which is flown only by a launch that was started with it"
         raise ConfigError(source, [f"mission.kind = {changed.mission.kind!r}: {own}"])
-    if problems := list(changed.mission.problems(config.swarm.agents)) or list(_infeasible(changed)):
+    mission = changed.mission
+    if problems := [*mission.kind_problems(), *mission.problems(config.swarm.agents), *_infeasible(changed)]:
         raise ConfigError(source, problems)
-    return changed.mission
+    return mission
 
 
 def load_recorded(folder: Path) -> Config:
@@ -296,6 +297,7 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
             "real time: swarmctl simulate, or python -m sitl --speed with clients of your own"
         )
+    yield from config.mission.kind_problems()
     yield from config.mission.problems(agents)
     yield from own_controller_problems(config.controller, separation, config.agent.barrier)
     drift_m = config.drift_m if agents > 1 else 0.0

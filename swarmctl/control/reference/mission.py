@@ -59,6 +59,21 @@ class MissionParams(Params):
         kind = _KINDS[self.kind]
         return self.section(kind) if kind.model_fields else kind()
 
+    def unused_sections(self) -> list[str]:
+        """Return the sections with values other than the default of kinds that are not flown."""
+        others = {name: kind for name, kind in _KINDS.items() if name != self.kind and not kind.has_own_verb}
+        found = [name for name, kind in others.items() if kind.model_fields and self.section(kind) != kind()]
+        return [*found, *(["own"] if self.own and not self.is_own else [])]
+
+    def kind_problems(self) -> Iterator[str]:
+        """Yield that sections of a kind are set but no kind, so that the default one would be flown."""
+        if "kind" not in self.model_fields_set and (unused := self.unused_sections()):
+            (named, *others) = unused
+            meant = "'module:Class'" if named == "own" else repr(named)
+            also = f", as {' and '.join(f'mission.{name}' for name in others)}" if others else ""
+            flown = f"{self.kind!r} would be flown, which is the default"
+            yield f"mission.{named} is set{also}, mission.kind is not: {flown}. Set mission.kind = {meant}"
+
     def problems(self, agents: int) -> Iterator[str]:
         """Yield problems that involve several keys."""
         return self.flown().problems(agents)
