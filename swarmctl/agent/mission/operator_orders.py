@@ -7,6 +7,7 @@ from swarmctl.agent.ports import Ports
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
+from swarmctl.control.phases.obeyed_orders import outcome_of
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.core.operator_verbs import EXCLUDE, MISSION, PEER, Order
 
@@ -42,7 +43,8 @@ class OperatorOrders:
     def ask(self, order: Order, now_us: int) -> str:
         """Obey an order, or return why it is refused; the operator is answered either way."""
         refusal = self._refusal(order, now_us)
-        self._world_model.answer(order, refusal)
+        comes_to = "" if refusal else outcome_of(order, self._state_machine.mission)
+        self._world_model.answer(order, refusal, comes_to)
         if refusal:
             self._alerts.put("order", f"{order.verb} refused: {refusal}", now_us)
             self._ports.note("order_refused", verb=order.verb, reason=refusal, **order.arguments)
