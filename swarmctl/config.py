@@ -30,6 +30,7 @@ from swarmctl.config_constraints import (
     vehicle_problems,
     volume_problems,
 )
+from swarmctl.config_obstacles import read_obstacles
 from swarmctl.config_problems import validated
 from swarmctl.config_sections import (
     BusParams,
@@ -213,7 +214,7 @@ def load(
     problems = [p for item in overrides for p in override(tree, item)]
     problems += [p for key, value in values.items() for p in set_value(tree, key, value)]
     folder = Path.cwd() if path is None else path.parent
-    problems = problems or read_tables(tree, folder) + read_show(tree, folder)
+    problems = problems or read_tables(tree, folder) + read_show(tree, folder) + read_obstacles(tree, folder)
     if problems:
         raise ConfigError(source, problems)
     locate(tree, folder)

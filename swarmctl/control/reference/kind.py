@@ -42,6 +42,7 @@ class Place:
 class MissionKind(Params):
     """Base of the parameters of one kind of mission; a kind without any has no section in the configuration."""
 
+    synonyms: ClassVar[tuple[str, ...]] = ()  # other words, which are no names of kinds
     has_own_verb: ClassVar[bool] = False  # which flies it, whatever kind the configuration names
     jumps: ClassVar[bool] = False  # positions are steps, which no vehicle follows: speed and acceleration don't count
 

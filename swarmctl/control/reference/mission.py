@@ -29,7 +29,8 @@ _KINDS = dict(sorted(MISSIONS.items()))
 if TYPE_CHECKING:
     MissionName = str
 else:
-    MissionName = Annotated[str, BuiltInOrOwn(tuple(_KINDS), GROUP)]
+    _SYNONYMS = tuple((word, name) for name, kind in _KINDS.items() for word in kind.synonyms)
+    MissionName = Annotated[str, BuiltInOrOwn(tuple(_KINDS), GROUP, _SYNONYMS)]
 
 
 @with_sections({name: kind for name, kind in _KINDS.items() if kind.model_fields})
@@ -46,6 +47,15 @@ class MissionParams(Params):
         """Tell whether the kind is somebody else's."""
         return self.kind not in _KINDS
 
+    def own_params(self) -> type[MissionKind]:
+        """Return the class of an own mission, which is that of its parameters.
+
+        Raises:
+            OwnError: there is no such own kind.
+        """
+        found: type[MissionKind] = own_class(self.kind, GROUP, MissionKind)
+        return found
+
     def flown(self) -> MissionKind:
         """Return the parameters of the kind that is flown.
 
@@ -54,8 +64,7 @@ class MissionParams(Params):
             ValidationError: its parameters are wrong.
         """
         if self.is_own:
-            found: type[MissionKind] = own_class(self.kind, GROUP, MissionKind)
-            return found.model_validate(self.own)
+            return self.own_params().model_validate(self.own)
         kind = _KINDS[self.kind]
         return self.section(kind) if kind.model_fields else kind()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +23,8 @@ OUTER_DELAY_S_M = 0.5  # delay of arrival per metre that a place is farther out
 @mission_kind("goto")
 class GotoParams(MissionKind):
     """Lets every agent fly smoothly to its goal and stay there, or around a goal that several share."""
+
+    synonyms: ClassVar[tuple[str, ...]] = ("goal", "goals")
 
     goals_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one for each agent, or a single one for all
     speed_m_s: float = Field(2.0, gt=0, le=20)  # approximate peak
