@@ -210,10 +210,10 @@ def load(
         ConfigError: the configuration is invalid; lists all problems with key, value, allowed range and fix.
     """
     source = str(path) if path else "defaults"
-    tree = read_tree(path)
+    tree, folder = read_tree(path), Path.cwd() if path is None else path.parent
+    read_obstacles(tree, folder)  # so that overrides may change one; what is wrong is said below
     problems = [p for item in overrides for p in override(tree, item)]
     problems += [p for key, value in values.items() for p in set_value(tree, key, value)]
-    folder = Path.cwd() if path is None else path.parent
     problems = problems or read_tables(tree, folder) + read_show(tree, folder) + read_obstacles(tree, folder)
     if problems:
         raise ConfigError(source, problems)

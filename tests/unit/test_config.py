@@ -136,7 +136,12 @@ def test_obstacles_may_be_in_a_file_beside_the_configuration(tmp_path: Path) -> 
     resolved = tmp_path / "run" / "config.toml"
     resolved.parent.mkdir()
     resolved.write_text(dump(config), encoding="utf-8")
+    changed = load(path, ["obstacles.0.radius_m=0.7"])
+    assert [obstacle.radius_m for obstacle in changed.obstacles] == [0.7]
+    (tmp_path / "others.toml").write_text("obstacles = []", encoding="utf-8")
+    assert load(path, ["obstacles=others.toml"]).obstacles == ()
     file.unlink()
+    assert load(path, ["obstacles=others.toml"]).obstacles == ()
     assert load(resolved) == config, "a run folder needs no other file"
     for text, words in (
         ("[swarm]\nagents = 2\n", "holds swarm; a file of obstacles holds [[obstacles]] alone"),
