@@ -20,6 +20,7 @@ from rich.progress import Progress
 from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
 from swarmctl.config_view import viewed_flight
+from swarmctl.config_warnings import warning_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
 from swarmctl.files import replace_bytes, replace_text, write_each
 from swarmctl.ops.status_table import PlainLines
@@ -129,6 +130,8 @@ def _run(options: dict[str, Any]) -> int:
     overrides = list(options["sets"])
     overrides += [f"{k}={options[k]}" for k in ("swarm.agents", "mission.duration_s", "seed") if options[k] is not None]
     config = load(options["config"], overrides)
+    for line in warning_lines(config):
+        print(line, file=sys.stderr)
     directory = create_run_folder(options["run_dir"], config.name, time.time_ns() // 1000)
     code = simulate(config, directory)
     if options["view"]:

@@ -22,6 +22,7 @@ from swarmctl.bus.network.hosts import HostParams, host_problems, roster_of
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.config_constraints import (
     forward_problems,
+    obstacle_problems,
     own_controller_problems,
     separation_problems,
     simulated_host_problems,
@@ -29,6 +30,7 @@ from swarmctl.config_constraints import (
     vehicle_problems,
     volume_problems,
 )
+from swarmctl.config_obstacles import read_obstacles
 from swarmctl.config_problems import validated
 from swarmctl.config_sections import (
     BusParams,
@@ -47,11 +49,12 @@ from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.feasibility import FlightLimits, infeasible
+from swarmctl.control.reference.kind import Place
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.own import OwnError
-from swarmctl.core.params import Params
+from swarmctl.core.params import FARTHEST_M, Params
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.parameter_names import parameter_problems
@@ -114,6 +117,27 @@ class Config(Params):
         x, y, z = self.start.center_ned_m
         return tuple((x + o * unit[0], y + o * unit[1], z + o * unit[2]) for o in offsets)
 
+    @property
+    def has_references(self) -> bool:
+        """Tell whether every agent has a start, and the mission's keys go together, so that references are known."""
+        listed, line = self.start.positions_ned_m, self.start.direction_ned
+        has_starts = len(listed) >= self.swarm.agents if listed else sum(c * c for c in line) > 0.0
+        near = has_starts and all(abs(c) <= FARTHEST_M for start in self.starts_ned_m() for c in start)
+        return near and not any(self.mission.problems(self.swarm.agents))
+
+    def goals_ned_m(self) -> tuple[tuple[float, ...] | None, ...]:
+        """Return where the mission takes every agent, shared NED [m]; None where it is flown for its way.
+
+        Nothing of a mission of somebody else's code is known, as it is not run here, nor of one that can't be flown.
+        """
+        agents = self.swarm.agents
+        if self.mission.is_own or not self.has_references:
+            return (None,) * agents
+        starts_ned_m = np.array(self.starts_ned_m())
+        flown, apart_m = self.mission.flown(), self.separation.budget.planned_m
+        places = (Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m) for agent in range(agents))
+        return tuple(None if goal is None else tuple(goal.pos_ned_m.tolist()) for goal in map(flown.goal, places))
+
     def sysids(self) -> tuple[int, ...]:
         """Return the MAVLink system id of every agent's vehicle."""
         if self.vehicles:
@@ -163,6 +187,7 @@ class Config(Params):
             duration_s=self.mission.duration_s,
             downwash=self.separation.downwash,
             volume=self.volume.flight_volume(),
+            goals_ned_m=self.goals_ned_m(),
         )
 
 
@@ -185,11 +210,11 @@ def load(
         ConfigError: the configuration is invalid; lists all problems with key, value, allowed range and fix.
     """
     source = str(path) if path else "defaults"
-    tree = read_tree(path)
+    tree, folder = read_tree(path), Path.cwd() if path is None else path.parent
+    read_obstacles(tree, folder)  # so that overrides may change one; what is wrong is said below
     problems = [p for item in overrides for p in override(tree, item)]
     problems += [p for key, value in values.items() for p in set_value(tree, key, value)]
-    folder = Path.cwd() if path is None else path.parent
-    problems = problems or read_tables(tree, folder) + read_show(tree, folder)
+    problems = problems or read_tables(tree, folder) + read_show(tree, folder) + read_obstacles(tree, folder)
     if problems:
         raise ConfigError(source, problems)
     locate(tree, folder)
@@ -198,7 +223,7 @@ def load(
     config = validated(Config, tree, source, _RENAMED)
     make_importable(config.own_folder)
     problems = list(own_problems(config.mission, config.controller, config.vehicle_model, config.separation))
-    problems = problems or list(_whole(config, only_agents)) or list(_infeasible(config))
+    problems = problems or [*_whole(config, only_agents), *_infeasible(config)]
     if problems:
         raise ConfigError(source, problems)
     return config
@@ -221,9 +246,10 @@ def load_mission(config: Config, path: Path) -> MissionParams:
     if changed.mission.is_own:
         own = "is somebody else's code, which is flown only by a launch that was started with it"
         raise ConfigError(source, [f"mission.kind = {changed.mission.kind!r}: {own}"])
-    if problems := list(changed.mission.problems(config.swarm.agents)) or list(_infeasible(changed)):
+    mission = changed.mission
+    if problems := [*mission.kind_problems(), *mission.problems(config.swarm.agents), *_infeasible(changed)]:
         raise ConfigError(source, problems)
-    return changed.mission
+    return mission
 
 
 def load_recorded(folder: Path) -> Config:
@@ -272,6 +298,7 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
             "real time: swarmctl simulate, or python -m sitl --speed with clients of your own"
         )
+    yield from config.mission.kind_problems()
     yield from config.mission.problems(agents)
     yield from own_controller_problems(config.controller, separation, config.agent.barrier)
     drift_m = config.drift_m if agents > 1 else 0.0
@@ -286,6 +313,7 @@ def _start_problems(config: Config) -> Iterator[str]:
         yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
     elif not (listed and listed < agents):
         yield from starts_apart(config.starts_ned_m(), config.separation, config.sitl)
+        yield from obstacle_problems(config.obstacles, config.starts_ned_m(), config.goals_ned_m())
         yield from config.geofence.problems(config.starts_ned_m())
         yield from volume_problems(
             config.volume, config.geofence, config.controller, config.separation, config.starts_ned_m(), config.drift_m
@@ -297,11 +325,14 @@ def _start_problems(config: Config) -> Iterator[str]:
 
 
 def _infeasible(config: Config) -> Iterator[str]:
-    """Yield why the references of a configuration without other problems can't be flown."""
+    """Yield why references can't be flown, as far as other problems let them be known."""
+    if not config.has_references or 0 < len(config.vehicles) < config.swarm.agents:
+        return
     separation = config.separation
+    close = any(starts_apart(config.starts_ned_m(), separation, config.sitl))
     limits = FlightLimits(
         duration_s=config.mission.duration_s,
-        apart_m=separation.radius_m,
+        apart_m=0.0 if close else separation.radius_m,  # what follows from starts is not said again
         downwash=separation.downwash,
         ground_z_m=config.sitl.ground_z_m if config.sitl.enabled else None,
         volume=config.volume.flight_volume(),

@@ -13,6 +13,8 @@ from swarmctl.control.collision.separation import SeparationParams, radius_probl
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.flight_volume import VolumeParams
+from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.params import FARTHEST_M
 from swarmctl.mavlink.geofence import GeofenceParams, is_inside
 from swarmctl.mavlink.transport import Endpoint, parse_url
 
@@ -84,6 +86,9 @@ def starts_apart(
         )
     if len(close) > _PAIRS_SHOWN:
         yield f"start: {len(close) - _PAIRS_SHOWN} more pairs of agents would wait too close together"
+    far = [i for i, start in enumerate(starts_ned_m) if max(map(abs, start)) > FARTHEST_M]
+    if far:
+        yield f"start: agents {far} wait more than {FARTHEST_M:g} m from the shared origin; move them or the origin"
     if sitl.enabled and sitl.start == "ground":
         for i, start in enumerate(starts_ned_m):
             if start[2] > sitl.ground_z_m - 0.5:
@@ -91,6 +96,25 @@ def starts_apart(
                     f"start: agent {i} waits at z = {start[2]} m, less than 0.5 m above the ground at "
                     f"sitl.ground_z_m = {sitl.ground_z_m} (NED, down is positive)"
                 )
+
+
+def obstacle_problems(
+    obstacles: Sequence[Obstacle],
+    starts_ned_m: Sequence[Sequence[float]],
+    goals_ned_m: Sequence[Sequence[float] | None],
+) -> Iterator[str]:
+    """Yield which agents would wait in an obstacle, and whose goal is in one that stays where it is."""
+    for i, obstacle in enumerate(obstacles):
+        goals = () if obstacle.moves else goals_ned_m
+        placed = [(f"agent {k} would wait", start) for k, start in enumerate(starts_ned_m)]
+        placed += [(f"the goal of agent {k} is", goal) for k, goal in enumerate(goals) if goal is not None]
+        inside = [(said, at) for said, at in placed if obstacle.distance_m(at) < obstacle.keep_out_m]
+        middle = "axis" if obstacle.column else "centre"
+        for said, at in inside[:_PAIRS_SHOWN]:
+            distance = f"{obstacle.distance_m(at):.2f} m from its {middle}"
+            yield f"obstacles.{i}: {said} {distance}; its keep_out_m is {obstacle.keep_out_m:g}. Move one of them"
+        if len(inside) > _PAIRS_SHOWN:
+            yield f"obstacles.{i}: {len(inside) - _PAIRS_SHOWN} more starts or goals are within its keep_out_m"
 
 
 def vehicle_problems(vehicles: Sequence[VehicleParams], agents: int, *, simulated: bool) -> Iterator[str]:

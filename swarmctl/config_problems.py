@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
@@ -15,6 +16,7 @@ from swarmctl.errors import ConfigError
 
 _PLACES_SHOWN = 3
 _PROBLEMS_SHOWN = 30
+_COMPONENTS = {"_ned": "north, east and down", "_ne_m": "north and east"}  # of vectors, by what their names hold
 _Model = TypeVar("_Model", bound=Params)
 
 
@@ -33,15 +35,32 @@ def validated(model: type[_Model], tree: Any, source: str, renamed: Mapping[str,
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        problems = [_explain(dict(e), model, renamed or {}) for e in error.errors(include_url=False)[:_PROBLEMS_SHOWN]]
-        hidden = error.error_count() - len(problems)
-        raise ConfigError(source, [*problems, *([f"and {hidden} more problems"] if hidden else [])]) from error
+        raise ConfigError(source, problems_of(error, model, renamed=renamed or {})) from error
 
 
-def _explain(error: dict[str, Any], root: type[Params], renamed: Mapping[str, str]) -> str:
+def problems_of(
+    error: ValidationError, model: type[Params], within: str = "", renamed: Mapping[str, str] = MappingProxyType({})
+) -> list[str]:
+    """Return what is wrong with a plain tree, a line each.
+
+    Args:
+        error: what validation has found.
+        model: class of the parameters.
+        within: the section they are in, "" for the whole configuration.
+        renamed: today's keys by former ones.
+    """
+    errors = error.errors(include_url=False)[:_PROBLEMS_SHOWN]
+    problems = dict.fromkeys(_explain(dict(found), model, within, renamed) for found in errors)
+    hidden = error.error_count() - len(errors)
+    return [*problems, *([f"and {hidden} more problems"] if hidden else [])]
+
+
+def _explain(error: dict[str, Any], root: type[Params], within: str, renamed: Mapping[str, str]) -> str:
     """Return one line with key, value, allowed range and fix."""
     location = [str(part) for part in error["loc"]]
-    key = printable(".".join(location), 100)
+    if _is_vector(error):
+        return _about_vector(error, location, within)
+    key = printable(".".join([*([within] if within else []), *location]), 100)
     value = shown(error.get("input"))
     if error["type"] == "extra_forbidden":
         return f"{key} = {value}: unknown key; {_hint(location, root, renamed)}"
@@ -49,7 +68,28 @@ def _explain(error: dict[str, Any], root: type[Params], renamed: Mapping[str, st
         return f"{key}: missing; add it"
     if error["type"] == "finite_number":
         return f"{key} = {value}: not a finite number; give a real one{_range_of(location, root)}"
-    return f"{key} = {value}: {error['msg'].lower()}{_range_of(location, root)}"
+    if error["type"] == "tuple_type":
+        sections = isinstance(error["input"], dict) and _keys_at(location, root)
+        return f"{key} = {value}: " + (f"one of a list; write [[{key}]]" if sections else "give a list in brackets")
+    message = error["msg"]
+    return f"{key} = {value}: {message[:1].lower()}{message[1:]}{_range_of(location, root)}"
+
+
+def _is_vector(error: Mapping[str, Any]) -> bool:
+    """Tell whether a vector has too few or too many numbers."""
+    place, values = error["loc"][-1] if error["loc"] else "", error.get("input")
+    short = error["type"] == "missing" and isinstance(place, int)
+    return isinstance(values, list | tuple) and (short or error["type"] == "too_long")
+
+
+def _about_vector(error: Mapping[str, Any], location: Sequence[str], within: str) -> str:
+    parts = [*([within] if within else []), *(location[:-1] if error["type"] == "missing" else location)]
+    name = next((part for part in reversed(parts) if not part.isdigit()), "")
+    wanted = next((names for suffix, names in _COMPONENTS.items() if suffix in name), None)
+    count = f"{len(error['input'])} value{'' if len(error['input']) == 1 else 's'}"
+    needed = "more are needed" if error["type"] == "missing" else error["msg"]
+    key = printable(".".join(parts), 100)
+    return f"{key} = {shown(error['input'])}: {count}; {needed if wanted is None else f'give {wanted}'}"
 
 
 def _hint(location: Sequence[str], root: type[Params], renamed: Mapping[str, str]) -> str:

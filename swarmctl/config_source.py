@@ -21,6 +21,7 @@ _MAX_DEPTH = 12  # nesting of sections and lists; a configuration needs 5
 _INT64 = range(-(2**63), 2**63)
 _MAX_SHOWN = 80
 _MAX_INDEX_DIGITS = 6  # digits
+_NO_FILE = "no such file. Give the path of a TOML file; swarmctl config init NAME writes one to begin with"
 
 
 def read_tree(path: Path | None) -> dict[str, Any]:
@@ -34,7 +35,7 @@ def read_tree(path: Path | None) -> dict[str, Any]:
     try:
         tree = tomllib.loads(read_file(path, _MAX_BYTES, follow=True).decode("utf-8"))
     except FileNotFoundError as error:
-        raise ConfigError(str(path), ["no such file. Give the path of a TOML file, for example configs/"]) from error
+        raise ConfigError(str(path), [_NO_FILE]) from error
     except OSError as error:
         raise ConfigError(str(path), [f"can't be read: {error.strerror}. Give the path of a TOML file"]) from error
     except UnicodeDecodeError as error:

@@ -16,6 +16,7 @@ from swarmctl.files import read_file
 
 _MAX_BYTES = 1_000_000  # of one file
 _MAX_SHOWN = 80
+_OTHER_MARKS = {";": "semicolons", "\t": "tabs", " ": "spaces"}  # between values, of files that have no commas
 
 
 def read_tables(tree: dict[str, Any], folder: Path) -> list[str]:
@@ -55,7 +56,12 @@ def _table(path: Path) -> tuple[dict[str, Any], str]:
     lines = [(number, cells) for number, cells in lines if cells and not cells[0].startswith("#")]
     if not lines:
         return {}, "is empty; its first line names the columns, for example t,x,y,z"
-    columns = [name.lower() for name in lines[0][1]]
+    first = lines[0][1]
+    if len(first) == 1 and (mark := next((mark for mark in _OTHER_MARKS if mark in first[0]), "")):
+        return {}, f"its values are separated by {_OTHER_MARKS[mark]}; separate them by commas, with points in decimals"
+    if all(_number(cell) is not None for cell in first):
+        return {}, "its first line holds numbers; it has to name the columns, for example t,x,y,z"
+    columns = [name.lower() for name in first]
     rows = []
     for number, cells in lines[1:]:
         numbers = [_number(cell) for cell in cells]

@@ -15,11 +15,13 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from swarmctl.config_problems import problems_of
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.own import OwnError
+from swarmctl.core.params import Params
 
 OWN_FOLDER = "own_folder"  # key of a configuration
 
@@ -48,7 +50,7 @@ def own_problems(
 ) -> Iterator[str]:
     """Yield why own missions and controllers can't be had, made, or take their parameters."""
     if mission.is_own:
-        yield from _problems("mission", mission.kind, mission.flown)
+        yield from _problems("mission", mission.kind, mission.flown, mission.own_params)
     if controller.is_own:
 
         def make() -> object:
@@ -56,15 +58,14 @@ def own_problems(
                 controller, vehicle, separation, 0, max_keep_outs=1, stopwatch_ns=time.perf_counter_ns
             )
 
-        yield from _problems("controller", controller.kind, make)
+        yield from _problems("controller", controller.kind, make, controller.own_params)
 
 
-def _problems(section: str, name: str, make: Callable[[], object]) -> Iterator[str]:
+def _problems(section: str, name: str, make: Callable[[], object], params: Callable[[], type[Params]]) -> Iterator[str]:
     try:
         make()
     except OwnError as error:
-        yield f"{section}.kind = {name!r}: {error}. Modules are looked for in the configuration's folder (own_folder)"
+        where = ". Modules are looked for in the configuration's folder (own_folder)" if error.not_found else ""
+        yield f"{section}.kind = {name!r}: {error}{where}"
     except ValidationError as error:
-        for item in error.errors(include_url=False):
-            key = ".".join(str(part) for part in item["loc"])
-            yield f"{section}.own.{key} = {item.get('input')!r}: {item['msg'].lower()}"
+        yield from problems_of(error, params(), f"{section}.own")

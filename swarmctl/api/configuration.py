@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from swarmctl.config import NO_VALUES, Config
 from swarmctl.config import load as load_config
+from swarmctl.config_warnings import config_warnings
 
 __all__ = ["Config", "load"]
 
@@ -16,7 +18,7 @@ def load(
     path: str | Path | None = None,
     set: Mapping[str, Any] = NO_VALUES,  # noqa: A002  (as the option is called)
 ) -> Config:
-    """Return the checked configuration of a run, which is frozen.
+    """Return the checked configuration of a run, which is frozen; warns of what may not be meant.
 
     Args:
         path: a TOML file; None for the defaults, the circle of the thesis.
@@ -27,7 +29,10 @@ def load(
         ConfigError: it is invalid; lists all problems with key, value, allowed range and fix.
     """
     values = {key: _plain(value) for key, value in set.items()}
-    return load_config(None if path is None else Path(path), values=values)
+    config = load_config(None if path is None else Path(path), values=values)
+    for text in config_warnings(config):
+        warnings.warn(text, stacklevel=2)
+    return config
 
 
 def _plain(value: Any) -> Any:

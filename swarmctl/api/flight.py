@@ -17,7 +17,7 @@ import msgspec
 from swarmctl.api.flight_process import FlightProcess
 from swarmctl.api.run import Run, load_run
 from swarmctl.config import Config, dump
-from swarmctl.core.operator_verbs import GOTO, MISSION, POINT, SPEED, YAW, Order, order_problem
+from swarmctl.core.operator_verbs import FAR, GOTO, MISSION, POINT, SPEED, YAW, Order, order_problem
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.errors import ConfigError, MissionError, StartError
 from swarmctl.files import read_file, replace_text
@@ -132,6 +132,7 @@ class Swarm:
         *,
         yaw_deg: float | None = None,
         speed_m_s: float | None = None,
+        far: bool = False,
     ) -> None:
         """Fly one agent to a point, and hold there until `resume`; see `order`.
 
@@ -140,9 +141,10 @@ class Swarm:
             point_ned_m: (3,) in the shared frame.
             yaw_deg: heading there, clockwise from north; None for that of the mission.
             speed_m_s: peak speed; None for `agent.state_machine.speed_m_s`.
+            far: fly there though it is more than 500 m away.
         """
         asked = dict(zip(POINT, map(float, point_ned_m), strict=True))
-        chosen = {YAW: yaw_deg, SPEED: speed_m_s}
+        chosen = {YAW: yaw_deg, SPEED: speed_m_s, FAR: 1.0 if far else None}
         self.order(GOTO, agent, **asked, **{name: value for name, value in chosen.items() if value is not None})
 
     def set_mission(self, file: str | Path, agents: Agents = None) -> None:

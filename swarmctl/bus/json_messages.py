@@ -24,7 +24,7 @@ _OBSTACLE_KEYS = {"center_ned_m", "radius_m", "keep_out_m", "visibility_m"}  # n
 MAX_VERSION_STEP = (
     2**20
 )  # largest step of the list's version: late joiners have missed many, and forgers don't reach its end
-MAX_REASON = 500  # longest reason of a refusal
+MAX_REASON = 500  # longest reason of a refusal, or text about what is obeyed
 Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
@@ -89,7 +89,7 @@ class AnswerMessage(msgspec.Struct, frozen=True, kw_only=True):
     verb: Word
     number: Count
     accepted: bool
-    reason: Annotated[str, msgspec.Meta(max_length=MAX_REASON)]  # why it is refused
+    reason: Annotated[str, msgspec.Meta(max_length=MAX_REASON)]  # why it is refused, or what it comes to
     utc_us: Count  # time of sending, by the agent's clock
 
     @property

@@ -85,11 +85,12 @@ class Orders:
             if utc_us - misdated.first_us > VALID_US:
                 self._refuse_misdated(number, misdated.reason, utc_us)
 
-    def answer(self, order: Order, refusal: str) -> None:
-        """Keep the answer to an order that was taken: accepted, or why it is refused."""
+    def answer(self, order: Order, refusal: str, comes_to: str = "") -> None:
+        """Keep the answer to an order that was taken: accepted, and what it comes to, or why it is refused."""
         if order.number == UNNUMBERED:
             return
-        self._answers[order.number] = self._due[order.number] = Answer(order.verb, order.number, not refusal, refusal)
+        answer = Answer(order.verb, order.number, not refusal, refusal or comes_to)
+        self._answers[order.number] = self._due[order.number] = answer
 
     def due_answers(self) -> list[Answer]:
         """Return the answers to send now, each once for as many repetitions as have arrived since the last call."""

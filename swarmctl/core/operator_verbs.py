@@ -53,13 +53,14 @@ class Answer:
     verb: str
     number: int
     accepted: bool
-    reason: str = ""  # why it is refused
+    reason: str = ""  # why it is refused, or what an accepted order comes to where its name does not say it
 
 
 EXCLUDE, PEER = "exclude", "peer"
 GOTO = "goto"
 POINT = ("north_m", "east_m", "down_m")  # arguments of `goto`, shared NED
-YAW, SPEED = "yaw_deg", "speed_m_s"  # and its optional ones
+YAW, SPEED, FAR = "yaw_deg", "speed_m_s", "far"  # and its optional ones
+FAR_M = 500.0  # from the vehicle; a point farther away is flown to only if that is said
 MISSION, BEGIN = "mission", "begin_utc_s"  # the verb, its argument of the same name: number of the mission; its begin
 _FAR_M = 100_000.0  # from the shared origin
 _AIRBORNE = frozenset({"TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND"})  # the agent decides where it flies
@@ -103,6 +104,14 @@ OPERATOR_VERBS = {
                 help="Peak speed [m/s]; default: agent.state_machine.speed_m_s.",
                 least=0.1,
                 most=20.0,
+                required=False,
+            ),
+            VerbArgument(
+                name=FAR,
+                option="--far",
+                help=f"Fly there though it is more than {FAR_M:g} m away.",
+                least=0.0,
+                most=1.0,
                 required=False,
             ),
         ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import importlib.metadata
 import re
@@ -23,7 +24,16 @@ def in_words(error: BaseException) -> str:
 
 
 class OwnError(Exception):
-    """A class that a configuration names can't be had; the text says why."""
+    """A class that a configuration names can't be had; the text says why.
+
+    Args:
+        text: why.
+        not_found: there is no such module, rather than that something is wrong with it.
+    """
+
+    def __init__(self, text: str, *, not_found: bool = False) -> None:
+        super().__init__(text)
+        self.not_found = not_found
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +42,7 @@ class BuiltInOrOwn:
 
     names: tuple[str, ...]
     group: str
+    synonyms: tuple[tuple[str, str], ...] = ()  # other words for built-in names, to suggest those
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_after_validator_function(self._checked, handler(source))
@@ -39,8 +50,11 @@ class BuiltInOrOwn:
     def _checked(self, name: str) -> str:
         if name in self.names or _NAME.fullmatch(name) or name in _offered(self.group):
             return name
-        known = ", ".join(f"'{known}'" for known in (*self.names, *_offered(self.group)))
-        raise PydanticCustomError("own", "input should be {known} or 'package.module:Class'", {"known": known})
+        names = (*self.names, *_offered(self.group))
+        meant = dict(self.synonyms).get(name.lower()) or next(iter(difflib.get_close_matches(name, names, 1)), "")
+        hint = f"did you mean '{meant}'? " if meant else ""
+        said = {"known": ", ".join(f"'{known}'" for known in names), "hint": hint}
+        raise PydanticCustomError("own", "{hint}input should be {known} or 'package.module:Class'", said)
 
 
 def own_class(name: str, group: str, base: type) -> Any:
@@ -58,7 +72,9 @@ def own_class(name: str, group: str, base: type) -> Any:
     try:
         found = getattr(importlib.import_module(module), attribute, None)
     except (Exception, SystemExit) as error:  # whatever the module does when it is imported
-        raise OwnError(f"{module} can't be imported: {in_words(error)}") from error
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        not_found = missing is not None and f"{module}.".startswith(f"{missing}.")
+        raise OwnError(f"{module} can't be imported: {in_words(error)}", not_found=not_found) from error
     if not isinstance(found, type) or not issubclass(found, base):
         raise OwnError(f"{module} has no class {attribute} derived from {base.__module__}.{base.__name__}")
     return found

@@ -36,5 +36,6 @@ def with_sections(sections: Mapping[str, type[Params]]) -> Callable[[type[P]], t
     return extended
 
 
+FARTHEST_M = 1e6  # of anything from the shared origin, along any axis
 Vec2 = Annotated[tuple[float, float], Field(strict=False)]  # not strict: TOML arrays are lists
 Vec3 = Annotated[tuple[float, float, float], Field(strict=False)]  # not strict: TOML arrays are lists

@@ -123,6 +123,8 @@ def schema() -> str:
     found = Config.model_json_schema()
     described: set[str] = set()
     _describe(Config, found, found.get("$defs", {}), described)
+    listed = found["properties"]["obstacles"]
+    found["properties"]["obstacles"] = {"anyOf": [listed, {"type": "string", "description": "a file of [[obstacles]]"}]}
     return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **found}, indent=2)
 
 

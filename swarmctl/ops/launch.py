@@ -23,6 +23,7 @@ from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import OBSTACLES, OPERATOR, STATUS, TICK, Topic
 from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, socket_file
 from swarmctl.config import Config, dump
+from swarmctl.config_warnings import warning_lines
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text
 from swarmctl.ops.operator import RunningLaunch, announce, list_keepers, process_start_s, utc_us, withdraw
@@ -181,7 +182,7 @@ class Launcher(Services):
         for command in agent_commands(config, context, reserved.sockets, reserved.vehicle_sockets):
             self._spawn(command)
         self.announce("")
-        for line in _introduction(config, context, reserved):
+        for line in (*_introduction(config, context, reserved), *warning_lines(config)):
             self.display.print_line(line)
         realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
         self.log.write(

@@ -49,10 +49,16 @@ class Reply:
         return ""
 
     @property
+    def comes_to(self) -> str:
+        """Return what an accepted order comes to, as the agent says it; "" where its name says it."""
+        return printable(self.answer.reason) if self.answer is not None and self.answer.accepted else ""
+
+    @property
     def line(self) -> str:
         """Return one line for the operator."""
         where = "" if self.phase is None else f", {self.phase.name}"
-        return self.problem or f"{agent_name(self.agent)} accepts{where}"
+        comes_to = f"; {self.comes_to}" if self.comes_to else ""
+        return self.problem or f"{agent_name(self.agent)} accepts{where}{comes_to}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the same for programs; `accepted` is None of an agent that was silent."""
@@ -61,6 +67,7 @@ class Reply:
             "accepted": None if self.answer is None else self.answer.accepted,
             "phase": None if self.phase is None else self.phase.name,
             "problem": self.problem,
+            "comes_to": self.comes_to,
         }
 
 

@@ -12,6 +12,8 @@ from swarmctl.mavlink.signing.refusals import HARMLESS
 from swarmctl.ops.launch_result import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 
+_MISSED_SHOWN = 5  # agents that are named because they have not reached their goals
+
 
 def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Callable[[str], None]) -> bool:
     """Finish the run folder and print the result; return whether the referee found a violation.
@@ -90,8 +92,9 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
     timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
     tick, solve, age = _section(timing, "tick_ms"), _section(timing, "solve_ms"), _section(comms, "path_age_ms")
     rejected = sum(_section(comms, "rejected").values())
+    goals = _goals(_section(summary, "goals"))
     error = f"summed mean tracking error {_m(_section(summary, 'tracking').get('index_m'))}"
-    outcome = f"{summary.get('outcome')}, {error} ({SUMMED_ERROR})"
+    outcome = f"{summary.get('outcome')}, {goals}{error} ({SUMMED_ERROR})"
     if len(violations) == 1:
         outcome += f"; 1 violation: {printable(violations[0])}"
     elif violations:
@@ -120,6 +123,23 @@ def _separation(summary: Mapping[str, Any]) -> str:
     if summary.get("agents") == 1:
         return "no other agent"
     return f"separation {_m(found.get('min_m'))} (required {_m(found.get('required_m'))})"
+
+
+def _goals(found: Mapping[str, Any]) -> str:
+    """Return how many agents have reached their goals, and who has not; "" of a mission without goals."""
+    if not found:
+        return ""
+    missed = [row for row in found["agents"] if row["reached_at_s"] is None]
+    if not missed:
+        last_s = max(row["reached_at_s"] for row in found["agents"])
+        return f"{found['of']} of {found['of']} goals reached, the last after {last_s:.1f} s, "
+    said = [f"agent {row['id']} {_far(row['left_m'])}" for row in missed[:_MISSED_SHOWN]]
+    said += [f"{len(missed) - _MISSED_SHOWN} more are not there"] if len(missed) > _MISSED_SHOWN else []
+    return f"only {found['reached']} of {found['of']} goals reached ({', '.join(said)}), "
+
+
+def _far(left_m: float | None) -> str:
+    return "never began" if left_m is None else f"is {left_m:.2f} m away"
 
 
 def _refused_frames(comms: Mapping[str, Any]) -> str:

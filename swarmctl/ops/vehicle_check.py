@@ -7,6 +7,7 @@ configured built-in simulator is started for the check and ended with it.
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,6 +22,7 @@ from swarmctl.check.services import corners_deg, has_fence, wants_fence
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import as_json, print_check
 from swarmctl.config import Config
+from swarmctl.config_warnings import warning_lines
 from swarmctl.errors import StartError
 from swarmctl.ops.vehicle_links import VehicleLinks, open_links
 from swarmctl.process_lifetime import StopRequest
@@ -50,6 +52,8 @@ def check(config: Config, options: CheckOptions) -> int:
     Raises:
         StartError: the built-in simulator does not come up, or the JSON file can't be written.
     """
+    for line in warning_lines(config):
+        print(line, file=sys.stderr)
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)  # so that started processes are ended
     with ended_cleanly, open_links(config, options.connect_s) as opened:
         vehicles, changed = _scan(config, options, opened)

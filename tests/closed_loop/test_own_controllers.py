@@ -88,9 +88,12 @@ def test_controllers_that_fail_are_caught_and_vehicles_brought_to_rest(told: dic
         assert pilot.outcome.startswith(ended), "what is not asked any more ends the mission, and is named"
 
 
-@pytest.mark.parametrize(("name", "rmse_m"), [("own_pid", 0.1), ("own_lqr", 0.1), ("own_spiral", 0.05)])
-def test_every_example_flies(name: str, rmse_m: float) -> None:
-    short = ("sitl.start=air", "mission.duration_s=2", *(() if name == "own_pid" else ("swarm.agents=1",)))
+@pytest.mark.parametrize(
+    ("name", "rmse_m", "duration_s"),
+    [("own_pid", 0.1, 2), ("own_lqr", 0.1, 4), ("own_spiral", 0.05, 2)],  # less than 4 s do not reach its goal
+)
+def test_every_example_flies(name: str, rmse_m: float, duration_s: int) -> None:
+    short = ("sitl.start=air", f"mission.duration_s={duration_s}", *(() if name == "own_pid" else ("swarm.agents=1",)))
     flight = fly_now(*short, config=f"examples/{name}.toml", until=mission_is_over)
     assert flight.outcomes == {"completed"}
     for agent in range(flight.config.swarm.agents):

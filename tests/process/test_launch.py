@@ -295,7 +295,10 @@ def test_operator_verbs(
     assert [(status["held"], status["control"]) for status in statuses] == [(False, "TRACKING"), (True, "HOLD")]
     sent = verb("goto", "0", "-2,0.5,-9", "--speed", "1")
     assert sent.returncode == 0, sent.stderr
-    assert "agent-0 accepts, TRACK" in sent.stdout
+    assert re.search(r"agent-0 accepts, TRACK; flies to -2, 0.5, -9: \d+\.\d m, \d+ s", sent.stdout)
+    far = verb("goto", "0", "1000,2,-9")
+    assert far.returncode == 4
+    assert re.search(r"agent-0 refuses: 1000, 2, -9 is 10\d\d m away; beyond 500 m say --far", far.stderr)
     assert json.loads(verb("status", "--json").stdout)[0]["control"] == "GOTO"
     buried = verb("goto", "0", "-2,0.5,500")
     assert buried.returncode == 4

@@ -58,6 +58,14 @@ def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
         ("mission.duration_s='5'", ("mission.duration_s = '5'", "number")),
         ("start.center_ned_m=[0.0, nan, 0.0]", ("start.center_ned_m.1 = nan", "finite")),
         ("start.center_ned_m=[0.0, 1.0]", ("start.center_ned_m",)),
+        ("mission.goto.goals_ned_m=[[5.0, 1.0]]", ("goals_ned_m.0 = [5.0, 1.0]: 2 values; give north, east and down",)),
+        ("mission.goto.goals_ned_m=[[5.0]]", ("goals_ned_m.0 = [5.0]: 1 value; give north, east and down",)),
+        ("start.center_ned_m=[1.0, 2.0, 3.0, 4.0]", ("4 values; give north, east and down",)),
+        ("volume.corners_ne_m=[[1.0]]", ("corners_ne_m.0 = [1.0]: 1 value; give north and east",)),
+        ("mission.steps.rows=[[0.0, 1.0]]", ("rows.0 = [0.0, 1.0]: 2 values; more are needed",)),
+        ("mission.goto.goals_ned_m=[5.0, 1.0, -2.0]", ("goals_ned_m.0 = 5.0: give a list in brackets",)),
+        ("obstacles={center_ned_m=[4.0, 0.0, 0.0]}", ("one of a list; write [[obstacles]]",)),
+        ("mission.waypoints.lists={times_s=[]}", ("one of a list; write [[mission.waypoints.lists]]",)),
         ("sitl.preset='mars'", ("sitl.preset = 'mars'", "thesis", "x500")),
         ("telemetry.port=0", ("telemetry.port = 0", ">= 1", "<= 65535")),
         ("name='../../etc'", ("name = '../../etc'",)),
@@ -110,6 +118,88 @@ def test_refused_in_one_line_with_key_value_and_what_is_allowed(
     for word in words:
         assert word in text, problems
     assert "\n" not in text
+
+
+def test_a_vector_is_reported_once_and_a_missing_file_as_itself(tmp_path: Path) -> None:
+    assert len(refusals(None, "mission.goto.goals_ned_m=[[5.0]]")) == 1
+    (missing,) = refusals(tmp_path / "none.toml")
+    assert missing.endswith("swarmctl config init NAME writes one to begin with")
+
+
+def test_obstacles_may_be_in_a_file_beside_the_configuration(tmp_path: Path) -> None:
+    path = file_with(tmp_path, 'obstacles = "obs.toml"\n')
+    assert "no such file" in refusals(path)[0]
+    file = tmp_path / "obs.toml"
+    file.write_text("[[obstacles]]\ncenter_ned_m = [9.0, 4.0, 0.0]\nradius_m = 0.5\n", encoding="utf-8")
+    config = load(path)
+    assert [obstacle.center_ned_m for obstacle in config.obstacles] == [(9.0, 4.0, 0.0)]
+    resolved = tmp_path / "run" / "config.toml"
+    resolved.parent.mkdir()
+    resolved.write_text(dump(config), encoding="utf-8")
+    changed = load(path, ["obstacles.0.radius_m=0.7"])
+    assert [obstacle.radius_m for obstacle in changed.obstacles] == [0.7]
+    (tmp_path / "others.toml").write_text("obstacles = []", encoding="utf-8")
+    assert load(path, ["obstacles=others.toml"]).obstacles == ()
+    file.unlink()
+    assert load(path, ["obstacles=others.toml"]).obstacles == ()
+    assert load(resolved) == config, "a run folder needs no other file"
+    for text, words in (
+        ("[swarm]\nagents = 2\n", "holds swarm; a file of obstacles holds [[obstacles]] alone"),
+        ("", "holds none"),
+        ("[[obstacles]]\nradius_m = 0.5\n", "obstacles.0.center_ned_m: missing"),
+        ("[[obstacles", "not TOML"),
+        ("[obstacles]\nradius_m = 0.5\n", "write [[obstacles]]"),
+        ('obstacles = "again.toml"\n', "holds none"),
+    ):
+        file.write_text(text, encoding="utf-8")
+        assert words in refusals(path)[0]
+
+
+TWO_OBSTACLES = (
+    "obstacles=[{center_ned_m=[4, 0, 0]}, {center_ned_m=[0, 3, 0], column=true, radius_m=0.3, keep_out_m=1.0}]"
+)
+GOTO = "mission.kind=goto"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (("start.center_ned_m=[3, 0, 0]",), "obstacles.0: agent 2 would wait 0.00 m from its centre; its keep_out_m"),
+        (("start.center_ned_m=[0, 2.1, -9]",), "obstacles.1: agent 1 would wait 0.90 m from its axis"),
+        (
+            (GOTO, "mission.goto.goals_ned_m=[[-9, 0, 0], [4, 1.5, 0], [9, 0, 0]]"),
+            "obstacles.0: the goal of agent 1 is 1.50 m from its centre; its keep_out_m is 1.75. Move one of them",
+        ),
+        ((GOTO, "mission.goto.goals_ned_m=[[4, 0, 0]]"), "obstacles.0: the goal of agent 2"),  # places round it
+        (("start.center_ned_m=[1e200, 0, 0]",), "more than 1e+06 m from the shared origin"),
+        ((GOTO, "mission.goto.goals_ned_m=[[1e200, 0, 0]]"), "goals [0] are more than 1e+06 m"),
+    ],
+)
+def test_starts_and_goals_in_obstacles_or_beyond_all_bounds(overrides: tuple[str, ...], words: str) -> None:
+    assert any(words in problem for problem in refusals(None, TWO_OBSTACLES, *overrides))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        (),
+        ("start.center_ned_m=[1.2, 0, 0]",),
+        (GOTO, "mission.goto.goals_ned_m=[[-9, 0, 0], [4, 1.8, 0], [9, 0, 0]]"),
+        (GOTO, "mission.goto.goals_ned_m=[[4, 0, -2]]"),  # above it
+        (GOTO, "mission.goto.goals_ned_m=[[4, 0, 0]]", "obstacles.0.vel_ned_m_s=[0, 1, 0]"),  # not there for long
+    ],
+)
+def test_negative_control_clear_of_obstacles(overrides: tuple[str, ...]) -> None:
+    load(None, (TWO_OBSTACLES, *overrides))
+
+
+def test_problems_of_starts_goals_and_references_are_named_together() -> None:
+    low = "mission.goto.goals_ned_m=[[-9, 0, 3], [4, 0, 0], [9, 0, 0]]"
+    problems = refusals(None, TWO_OBSTACLES, GOTO, low, "start.spacing_m=0.3", "mission.duration_s=6")
+    for words in ("agents 0 and 1 would wait 0.30 m apart", "the goal of agent 1 is", "duration_s = 6", "the ground"):
+        assert any(words in problem for problem in problems), words
+    hover = refusals(None, "mission.kind=hover", "start.spacing_m=0.3")
+    assert all(problem.startswith("start: ") for problem in hover), "what follows from starts is not said again"
 
 
 def test_a_refused_number_of_agents_is_reported_once() -> None:

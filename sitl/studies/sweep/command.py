@@ -1,6 +1,7 @@
 """The command line of the `sweep` verb. What flies is imported after it is read, so that `--help` is quick.
 
-`python -m sitl.studies.sweep.command [CONFIG] --set KEY=V,V [--set KEY=V,V] [--seeds N] [--jobs N] [--out DIR]`
+`python -m sitl.studies.sweep.command [CONFIG] --set KEY=V,V [--set KEY=V,V] [--duration S] [--seeds N] [--seed K]
+[--jobs N] [--out DIR]`
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from swarmctl.errors import exit_code_of
 
 _WHAT = """Fly every combination of values in lockstep, faster than real time, on all processors. The same call again
 goes on where it stopped. Rows go to OUT/rows.parquet as they come in; OUT/report.html has the table and charts."""
+_MOST_SEED = 2**31 - 1
 _SET_HELP = "values of a key, separated by commas outside of brackets; repeatable"
 
 
@@ -24,7 +26,13 @@ def main(arguments: list[str] | None = None) -> int:
     from sitl.studies.sweep.sweep import SweepOptions, sweep
 
     asked = SweepOptions(
-        config=options.config, sets=tuple(options.sets), seeds=options.seeds, jobs=options.jobs, out=options.out
+        config=options.config,
+        sets=tuple(options.sets),
+        seeds=options.seeds,
+        jobs=options.jobs,
+        out=options.out,
+        fixed=() if options.duration is None else (f"mission.duration_s={options.duration}",),
+        first_seed=options.seed,
     )
     return exit_code_of(partial(sweep, asked), f"interrupted; the same call goes on from {options.out}")
 
@@ -34,7 +42,9 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("config", nargs="?", type=Path, metavar="CONFIG", help="TOML file; default: the circle of the thesis")
     add("--set", metavar="KEY=V,V", dest="sets", action="append", default=[], help=_SET_HELP)
+    add("--duration", metavar="S", help="duration of every mission [s]; default: that of the configuration")
     add("--seeds", metavar="N", type=_count, default=1, help="seeds of every combination; default %(default)s")
+    add("--seed", metavar="K", type=_seed, help="the first of them; default: that of the configuration")
     add("--jobs", metavar="N", type=_count, default=os.cpu_count() or 1, help="processes; default %(default)s")
     add("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="folder; default %(default)s")
     return parser
@@ -43,6 +53,12 @@ def _parser() -> argparse.ArgumentParser:
 def _count(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= 10_000:
         raise argparse.ArgumentTypeError(f"{text!r}: allowed: 1 to 10000")
+    return int(text)
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal() or int(text) > _MOST_SEED:
+        raise argparse.ArgumentTypeError(f"{text!r}: allowed: 0 to {_MOST_SEED}")
     return int(text)
 
 

@@ -44,17 +44,25 @@ class Flight:
         """Return it as options of the command line."""
         return " ".join([*(f"--set {key}={value}" for key, value in self.settings), f"--seed {self.seed}"])
 
-    def config(self, base: Path | None) -> Config:
+    def config(self, base: Path | None, fixed: Sequence[str] = ()) -> Config:
         """Return its configuration.
+
+        Args:
+            base: a TOML file; None for the defaults.
+            fixed: `key=value` of every flight.
 
         Raises:
             ConfigError: a key does not exist, or values don't go together.
         """
-        return load(base, [*(f"{key}={value}" for key, value in self.settings), f"seed={self.seed}"])
+        return load(base, [*fixed, *(f"{key}={value}" for key, value in self.settings), f"seed={self.seed}"])
 
 
-def parse_axes(items: Sequence[str]) -> list[Axis]:
+def parse_axes(items: Sequence[str], fixed: Sequence[str] = ()) -> list[Axis]:
     """Return the axes that `key=value,value` items describe.
+
+    Args:
+        items: what is swept.
+        fixed: `key=value` of every flight, of keys that can't be swept therefore.
 
     Raises:
         ConfigError: an item is none; lists all.
@@ -68,6 +76,8 @@ def parse_axes(items: Sequence[str]) -> list[Axis]:
     keys = [axis.key for axis in axes]
     twice = sorted({key for key in keys if keys.count(key) > 1})
     problems += [f"--set {key}: given twice; write all its values in one" for key in twice]
+    settled = [item.partition("=")[0] for item in fixed]
+    problems += [f"--set {key}: is the same in every flight by another option" for key in keys if key in settled]
     if "seed" in keys:
         problems.append("--set seed: give the number of seeds with --seeds")
     if not axes:
@@ -92,12 +102,12 @@ def flights_of(axes: Sequence[Axis], first_seed: int, seeds: int) -> list[Flight
     return [Flight(settings, seed) for seed in range(first_seed, first_seed + seeds) for settings in combinations]
 
 
-def problems_of(flights: Sequence[Flight], base: Path | None) -> Iterator[str]:
+def problems_of(flights: Sequence[Flight], base: Path | None, fixed: Sequence[str] = ()) -> Iterator[str]:
     """Yield why combinations can't be flown, each reason once, with the first combination that has it."""
     said: set[str] = set()
     for flight in flights:
         try:
-            flight.config(base)
+            flight.config(base, fixed)
         except ConfigError as error:
             new = [problem for problem in error.problems if problem not in said]
             said.update(new)

@@ -39,6 +39,8 @@ class SweepOptions:
     seeds: int
     jobs: int
     out: Path
+    fixed: tuple[str, ...] = ()  # `key=value` of every flight
+    first_seed: int | None = None  # None: that of the configuration
 
 
 def sweep(options: SweepOptions) -> int:
@@ -48,10 +50,10 @@ def sweep(options: SweepOptions) -> int:
         ConfigError: a combination is impossible, or the folder holds another sweep.
         StartError: a process ended by itself.
     """
-    base = load(options.config)
-    axes = parse_axes(options.sets)
-    flights = flights_of(axes, base.seed, options.seeds)
-    if problems := list(problems_of(flights, options.config)):
+    base = load(options.config, options.fixed)
+    axes = parse_axes(options.sets, options.fixed)
+    flights = flights_of(axes, base.seed if options.first_seed is None else options.first_seed, options.seeds)
+    if problems := list(problems_of(flights, options.config, options.fixed)):
         raise ConfigError("sweep", problems)
     options.out.mkdir(parents=True, exist_ok=True)
     _claim(options.out, base)

@@ -7,6 +7,7 @@ from swarmctl.agent.ports import Ports
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
+from swarmctl.control.phases.obeyed_orders import outcome_of
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.core.operator_verbs import EXCLUDE, MISSION, PEER, Order
 
@@ -42,7 +43,8 @@ class OperatorOrders:
     def ask(self, order: Order, now_us: int) -> str:
         """Obey an order, or return why it is refused; the operator is answered either way."""
         refusal = self._refusal(order, now_us)
-        self._world_model.answer(order, refusal)
+        comes_to = "" if refusal else outcome_of(order, self._state_machine.mission)
+        self._world_model.answer(order, refusal, comes_to)
         if refusal:
             self._alerts.put("order", f"{order.verb} refused: {refusal}", now_us)
             self._ports.note("order_refused", verb=order.verb, reason=refusal, **order.arguments)
@@ -50,7 +52,11 @@ class OperatorOrders:
         self._ports.note("operator", verb=order.verb, **order.arguments)
         offered = self._state_machine.mission.offered
         if order.verb == MISSION and offered is not None:
-            self._ports.note("mission_changed", duration_s=offered.duration_s, mission=offered.text)
+            goal = offered.reference.goal
+            pos_ned_m = None if goal is None else goal.pos_ned_m.tolist()
+            self._ports.note(
+                "mission_changed", duration_s=offered.duration_s, mission=offered.text, goal_ned_m=pos_ned_m
+            )
         return ""
 
     def _refusal(self, order: Order, now_us: int) -> str:

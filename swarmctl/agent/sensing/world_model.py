@@ -103,9 +103,9 @@ class WorldModel:
         self.refusals.add(sender, topics.ENDED.name, IDENTITY, utc_us)
         return None
 
-    def answer(self, order: Order, refusal: str) -> None:
-        """Keep the agent's answer to an order: accepted, or why it is refused."""
-        self._orders.answer(order, refusal)
+    def answer(self, order: Order, refusal: str, comes_to: str = "") -> None:
+        """Keep the agent's answer to an order: accepted, and what it comes to, or why it is refused."""
+        self._orders.answer(order, refusal, comes_to)
 
     def due_answers(self) -> list[Answer]:
         """Return the answers to operators' orders and their repetitions that are to be sent now."""

@@ -56,6 +56,15 @@ class ControllerParams(Params):
         """Tell whether the controller is somebody else's."""
         return self.kind not in CONTROLLERS
 
+    def own_params(self) -> type[Params]:
+        """Return the class of an own controller's parameters.
+
+        Raises:
+            OwnError: there is no such controller.
+        """
+        found: type[Params] = own_class(self.kind, GROUP, OwnController).Params
+        return found
+
 
 def make_controller(
     params: ControllerParams,

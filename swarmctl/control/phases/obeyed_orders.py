@@ -12,6 +12,8 @@ from swarmctl.control.phases.mission_state import SPIN_UP_US, MissionState
 from swarmctl.core.operator_verbs import BEGIN, GOTO, MISSION, POINT, SPEED, YAW, Order
 from swarmctl.core.types import Landed, Phase, VehicleState
 
+_MINUTES = 3.0  # a longer flight is told in minutes
+_WHOLE_M = 100.0  # a longer way is told in whole metres
 OPERATOR_STOP = "stopped by the operator"
 
 
@@ -45,6 +47,18 @@ def _goto(mission: MissionState, order: Order, now_us: int, utc_us: int, state: 
         yaw_rad=math.radians(arguments[YAW]) if YAW in arguments else None,
     )
     mission.interruptions.move_hold(point, now_us, state)
+
+
+def outcome_of(order: Order, mission: MissionState) -> str:
+    """Return what an order that was obeyed comes to, in words; "" where its name says it."""
+    begun = mission.trajectories.current
+    if order.verb != GOTO or begun is None:
+        return ""
+    way = begun.trajectory
+    place = ", ".join(f"{part:g}" for part in way.to_ned_m.tolist())
+    away_m, minutes = math.dist(way.from_ned_m, way.to_ned_m), way.travel_s / 60.0
+    takes = f"{minutes:.0f} min" if minutes > _MINUTES else f"{way.travel_s:.0f} s"
+    return f"flies to {place}: {away_m:.{0 if away_m > _WHOLE_M else 1}f} m, {takes}"
 
 
 def _change_mission(mission: MissionState, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:

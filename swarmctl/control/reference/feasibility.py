@@ -1,5 +1,5 @@
 """Checks before a flight whether references can be flown: finite, within the vehicles' limits, above ground, in the
-flight volume, apart.
+flight volume, apart, and long enough to arrive.
 
 Pure. A reference is sampled over the whole mission; what is refused is told with the first second at which it is wrong.
 """
@@ -17,6 +17,7 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.mission import MissionReference, Motion
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.goal import REACHED_M
 from swarmctl.core.types import Array
 
 _STEP_S = 0.02  # time between samples
@@ -64,9 +65,26 @@ def infeasible(
     if not found and references and references[0].fixed_in_time:
         for (i, a), (j, b) in itertools.combinations(enumerate(motions), 2):
             found += [f"mission: agents {i} and {j}: {first}" for first in _first(t_s, [_apart(a, b, limits)])]
+    yield from _cut_short(references, limits.duration_s)
     yield from found[:_SHOWN]
     if len(found) > _SHOWN:
         yield f"mission: {len(found) - _SHOWN} more agents or pairs of agents have references that can't be flown"
+
+
+def _cut_short(references: Sequence[MissionReference], duration_s: float) -> Iterator[str]:
+    """Yield that the mission ends before agents can be at their goals."""
+    left_m, needed_s = [], 0.0
+    for reference in references:
+        if reference.goal is not None and reference.goal.needs_s > duration_s:
+            end_ned_m = reference.sample(np.array([duration_s]))[0][0]
+            left_m.append(float(np.linalg.norm(end_ned_m - reference.goal.pos_ned_m)))
+            needed_s = max(needed_s, reference.goal.needs_s)
+    if max(left_m, default=0.0) > REACHED_M:
+        yield (
+            f"mission.duration_s = {duration_s:g}: it ends up to {max(left_m):.1f} m short of goals that take "
+            f"{needed_s:.1f} s at the mission's speed and acceleration. Give it more time, or raise speed_m_s and "
+            "accel_m_s2"
+        )
 
 
 def _first(t_s: Array, rules: Sequence[_Rule]) -> list[str]:

@@ -16,6 +16,7 @@ from typing import ClassVar, TypeVar
 import numpy as np
 
 from swarmctl.control.reference.goal_assignment import assigned_goals_ned_m
+from swarmctl.core.goal import Goal
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Sampled
 
@@ -41,6 +42,8 @@ class Place:
 class MissionKind(Params):
     """Base of the parameters of one kind of mission; a kind without any has no section in the configuration."""
 
+    synonyms: ClassVar[tuple[str, ...]] = ()  # other words, which are no names of kinds
+    has_own_verb: ClassVar[bool] = False  # which flies it, whatever kind the configuration names
     jumps: ClassVar[bool] = False  # positions are steps, which no vehicle follows: speed and acceleration don't count
 
     @property
@@ -59,6 +62,10 @@ class MissionKind(Params):
     def offset_ned_m(self, place: Place) -> Array:
         """Return what an agent adds to its reference (3,), because several share it."""
         return np.zeros(3)
+
+    def goal(self, place: Place) -> Goal | None:
+        """Return where one agent is meant to arrive; None for a kind that is flown for its way."""
+        return None
 
     def problems(self, agents: int) -> Iterator[str]:
         """Yield problems that involve several keys, if this kind is flown."""

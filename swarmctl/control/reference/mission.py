@@ -29,7 +29,8 @@ _KINDS = dict(sorted(MISSIONS.items()))
 if TYPE_CHECKING:
     MissionName = str
 else:
-    MissionName = Annotated[str, BuiltInOrOwn(tuple(_KINDS), GROUP)]
+    _SYNONYMS = tuple((word, name) for name, kind in _KINDS.items() for word in kind.synonyms)
+    MissionName = Annotated[str, BuiltInOrOwn(tuple(_KINDS), GROUP, _SYNONYMS)]
 
 
 @with_sections({name: kind for name, kind in _KINDS.items() if kind.model_fields})
@@ -46,6 +47,15 @@ class MissionParams(Params):
         """Tell whether the kind is somebody else's."""
         return self.kind not in _KINDS
 
+    def own_params(self) -> type[MissionKind]:
+        """Return the class of an own mission, which is that of its parameters.
+
+        Raises:
+            OwnError: there is no such own kind.
+        """
+        found: type[MissionKind] = own_class(self.kind, GROUP, MissionKind)
+        return found
+
     def flown(self) -> MissionKind:
         """Return the parameters of the kind that is flown.
 
@@ -54,10 +64,24 @@ class MissionParams(Params):
             ValidationError: its parameters are wrong.
         """
         if self.is_own:
-            found: type[MissionKind] = own_class(self.kind, GROUP, MissionKind)
-            return found.model_validate(self.own)
+            return self.own_params().model_validate(self.own)
         kind = _KINDS[self.kind]
         return self.section(kind) if kind.model_fields else kind()
+
+    def unused_sections(self) -> list[str]:
+        """Return the sections with values other than the default of kinds that are not flown."""
+        others = {name: kind for name, kind in _KINDS.items() if name != self.kind and not kind.has_own_verb}
+        found = [name for name, kind in others.items() if kind.model_fields and self.section(kind) != kind()]
+        return [*found, *(["own"] if self.own and not self.is_own else [])]
+
+    def kind_problems(self) -> Iterator[str]:
+        """Yield that sections of a kind are set but no kind, so that the default one would be flown."""
+        if "kind" not in self.model_fields_set and (unused := self.unused_sections()):
+            (named, *others) = unused
+            meant = "'module:Class'" if named == "own" else repr(named)
+            also = f", as {' and '.join(f'mission.{name}' for name in others)}" if others else ""
+            flown = f"{self.kind!r} would be flown, which is the default"
+            yield f"mission.{named} is set{also}, mission.kind is not: {flown}. Set mission.kind = {meant}"
 
     def problems(self, agents: int) -> Iterator[str]:
         """Yield problems that involve several keys."""
@@ -111,11 +135,13 @@ class MissionReference:
 
     Attributes:
         offset_ned_m: own place (3,) around a reference that several share; the error of tracking is that to the latter.
+        goal: where the agent is meant to arrive; None of a mission that is flown for its way, or somebody else's.
     """
 
     def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int, apart_m: float = 0.0) -> None:
         self._mission, self._start_ned_m, self._yaw_rad = params.flown(), starts_ned_m[agent], params.yaw_rad
         place = Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m)
+        self.goal = None if params.is_own else self._mission.goal(place)
         if params.is_own:
             self._sampled, self._heading, self.offset_ned_m = _tabulated(self._mission, place, params)
         else:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from swarmctl.core.operator_verbs import (
+    FAR,
+    FAR_M,
     GOTO,
     MISSION,
     OPERATOR_VERBS,
@@ -125,6 +127,7 @@ def _goto(
     point: Annotated[str, typer.Argument(metavar="N,E,D", help="Point, shared NED [m]; up is negative.")],
     yaw: Annotated[float | None, _option_of(GOTO, YAW)] = None,
     speed: Annotated[float | None, _option_of(GOTO, SPEED)] = None,
+    far: Annotated[bool, typer.Option("--far", help=f"Fly there though it is more than {FAR_M:g} m away.")] = False,
     run: Run = None,
     as_json: AsJson = False,
 ) -> int:
@@ -133,6 +136,8 @@ def _goto(
     problems: list[str] = []
     arguments = dict(zip(POINT, operator.vector("N,E,D", point, problems), strict=True))
     arguments |= {name: value for name, value in ((YAW, yaw), (SPEED, speed)) if value is not None}
+    if far:
+        arguments[FAR] = 1.0
     if problem := "".join(problems) or order_problem(GOTO, arguments):
         raise ConfigError(GOTO, [problem])
     return _give(Order(GOTO, arguments), run, [agent], as_json)

@@ -19,6 +19,7 @@ from swarmctl import __version__
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
+from swarmctl.telemetry.evaluation.arrivals import reached_goals
 from swarmctl.telemetry.evaluation.reception import refused_peers
 from swarmctl.telemetry.evaluation.run_counts import (
     commitment_counts,
@@ -66,6 +67,7 @@ class Rules:
     mode: Literal["realtime", "lockstep"] = "realtime"
     duration_s: float | None = None  # mission time that a completed run must have tracked
     volume: FlightVolume | None = None  # that nobody may leave
+    goals_ned_m: tuple[tuple[float, ...] | None, ...] = ()  # (3,) of every agent; None: its mission has none
     downwash: float = 1.0  # heights are divided by this in `scaled_min_m`, which is reported but not judged
 
 
@@ -99,13 +101,16 @@ def evaluate(
     """
     tracks = merge_tracks(run.ticks, run.truth, rules.agents)
     clock = _MissionClock(run.ticks, tracks)
-    separation, apart = _evaluate_separation(tracks, rules, _agents_here(run, rules), clock)
+    here = _agents_here(run, rules)
+    separation, apart = _evaluate_separation(tracks, rules, here, clock)
     obstacles, clear = _evaluate_obstacles(tracks, rules, clock)
     volume, inside = _evaluate_volume(run, tracks, rules, clock)
     timing, punctual = _evaluate_timing(run.ticks, rules, speed_factor)
     tracking, tracked_s = _evaluate_tracking(run, rules.agents, steady_after_s)
     unseen = [] if len(run.truth) else list(_unseen(run.ticks, rules.agents, clock))
     refused = _shorten(list(refused_peers(run.events)))
+    configured = dict(enumerate(rules.goals_ned_m))
+    goals_ned_m = {agent: configured.get(agent) for agent in here}
     violations = [*problems, *apart, *clear, *inside, *unseen, *punctual, *refused, *_not_a_number(run.truth)]
     if outcome == "completed":
         violations += _cut_short(tracked_s, rules, run.events)
@@ -117,6 +122,7 @@ def evaluate(
         "duration_s": max(tracked_s.values(), default=0.0),
         "mode": rules.mode,
         "tracking": tracking,
+        "goals": reached_goals(run.ticks, run.truth, run.events, goals_ned_m),
         "separation": separation,
         "obstacles": obstacles,
         "volume": volume,

@@ -69,6 +69,18 @@ class _Deadlocks(msgspec.Struct):
     unresolved: _Count = 0
 
 
+class _AtGoal(msgspec.Struct):
+    id: Annotated[int, msgspec.Meta(ge=0, lt=1000)]
+    reached_at_s: _Figure | None = None
+    left_m: _Figure | None = None
+
+
+class _Goals(msgspec.Struct):
+    reached: _Count
+    of: _Count
+    agents: list[_AtGoal]
+
+
 class _Summary(msgspec.Struct):
     outcome: Outcome
     violations: list[str]
@@ -81,8 +93,9 @@ class _Summary(msgspec.Struct):
     solver: _Solver
     comms: _Comms
     duration_s: _Figure | None = None
-    version: str = ""  # missing in older folders, as is the next
+    version: str = ""  # missing in older folders, as are the next
     deadlocks: _Deadlocks = msgspec.field(default_factory=_Deadlocks)
+    goals: _Goals | None = None
 
 
 def decode_summary(content: bytes) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from swarmctl.telemetry.report.svg import Figure
 REPORT = "report.html"
 FIGURES = "figures"
 _EVENTS_LISTED = 400
+_GOALS_LISTED = 12  # agents; the others are in summary.json
 
 
 def write_report(
@@ -105,6 +106,7 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     yield _least("smallest separation", separation["min_m"], separation["required_m"])
     if obstacles["min_clearance_m"] is not None:
         yield _least("nearest to an obstacle's centre", obstacles["min_clearance_m"], obstacles["required_m"])
+    yield from _goal_rows(summary.get("goals"))
     due = timing.get("due_ticks") or timing["ticks"]
     share = timing["late_ticks"] / due if due else None
     most = rules.deadline_misses_01 if rules else None
@@ -138,6 +140,17 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
         )
     if timing["speed_factor"] is not None:
         yield SummaryRow("speed", f"{timing['speed_factor']:.1f} x real time")
+
+
+def _goal_rows(goals: Mapping[str, Any] | None) -> Iterator[SummaryRow]:
+    """Yield whether agents have reached their goals, and when; nothing of a mission without goals."""
+    if goals is None:
+        return
+    yield SummaryRow("goals reached", f"{goals['reached']} of {goals['of']}", number=goals["reached"])
+    for row in goals["agents"][:_GOALS_LISTED]:
+        at_s = row["reached_at_s"]
+        said = f"{_figure(row['left_m'], 'm', 2)} away" if at_s is None else f"after {at_s:.1f} s"
+        yield SummaryRow(f"agent {row['id']} at its goal", said, number=at_s)
 
 
 def _least(name: str, value: float | None, limit: float) -> SummaryRow:

@@ -32,6 +32,7 @@ BOX = (
     "volume.ceiling_z_m=-4",
 )
 CROSSING = ("[[-4, 0, -1], [4, 0, -1]]", "[[0, -4, -1], [0, 4, -1]]")
+GOTO = ("mission.kind=goto", "mission.goto.goals_ned_m=[[49, 0, 0], [50, 0, 0], [51, 0, 0]]")
 TIMES = "times_s=[0.0, 8.0]"
 
 
@@ -54,6 +55,10 @@ TIMES = "times_s=[0.0, 8.0]"
             ("agent 0", "at 3.00 s", "0.10 m outside of the flight volume"),
         ),
         (two(*(f"{{points_ned_m={p}, {TIMES}}}" for p in CROSSING)), ("agents 0 and 1", "m apart", "radius_m = 0.9")),
+        (  # 50 m on at up to 2 m/s take 1.875 * 25 s
+            (*GOTO, "mission.duration_s=4"),
+            ("mission.duration_s = 4", "up to 49.7 m short of goals", "take 46.9 s", "speed_m_s"),
+        ),
     ],
 )
 def test_what_can_not_be_flown_is_refused_with_the_second_and_the_value(
@@ -73,6 +78,9 @@ def test_what_can_not_be_flown_is_refused_with_the_second_and_the_value(
         (LINE, "mission.line.velocity_ned_m_s=[0, 0, 0.5]", "mission.duration_s=7"),  # ends before the ground
         ("mission.circle.omega_rad_s=1.1",),
         ("mission.kind=steps",),  # jumps on purpose
+        (*GOTO, "mission.duration_s=43"),  # 0.25 m before the goals
+        (*GOTO, "mission.duration_s=8.7", "mission.goto.speed_m_s=18", "mission.goto.accel_m_s2=4"),
+        ("mission.kind=swap", "mission.duration_s=2"),  # whose time is a key itself
         two(*(f"{{points_ned_m={p}}}" for p in CROSSING)),  # not fixed in time: the controllers resolve it
         two(f"{{points_ned_m={CROSSING[0]}, {TIMES}}}", "{points_ned_m=[[0, -4, -3], [0, 4, -3]], times_s=[0, 8]}"),
     ],

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from swarmctl.control.phases.mission_state import TAKEN_OVER
-from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP, ORDERS
+from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP, ORDERS, outcome_of
 from swarmctl.control.phases.trajectories import OfferedMission
 from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.flight_volume import FlightVolume, VolumeParams
-from swarmctl.core.operator_verbs import BEGIN, EXCLUDE, GOTO, MISSION, OPERATOR_VERBS, order_problem
+from swarmctl.core.operator_verbs import BEGIN, EXCLUDE, FAR_M, GOTO, MISSION, OPERATOR_VERBS, Order, order_problem
 from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, START, Flight, controlled, in_phase
 
@@ -320,6 +320,28 @@ def test_a_point_in_the_ground_or_a_way_out_of_the_fence_is_refused() -> None:
     for north_m in (5.0, 9.0):
         assert "outside of the geofence" in fenced.ask(GOTO, **POINT | {"north_m": north_m})
     np.testing.assert_allclose(place(fenced), held_at)
+
+
+def test_a_point_far_away_is_flown_to_only_if_that_is_said() -> None:
+    flight = controlled(Phase.TRACK)
+    held_at = place(flight)
+    away = POINT | {"north_m": float(flight.pos[0]) + FAR_M + 1.0}
+    assert flight.ask(GOTO, **away).endswith(" is 501 m away; beyond 500 m say --far")
+    assert flight.ask(GOTO, **away, far=0.0)
+    np.testing.assert_allclose(place(flight), held_at)
+    assert flight.ask(GOTO, **POINT | {"north_m": float(flight.pos[0]) + FAR_M - 1.0}) == ""
+    assert flight.ask(GOTO, **away, far=1.0) == ""
+    np.testing.assert_allclose(place(flight, after_s=3000.0), list(away.values()))
+
+
+def test_what_a_goto_comes_to_is_said_and_of_other_orders_nothing() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos, flight.vel = np.array([3.0, -2.0, -2.0]), np.zeros(3)
+    flight.ask(GOTO, **POINT)
+    assert outcome_of(Order(GOTO, POINT), flight.mission) == "flies to 3, -2, -4: 2.0 m, 3 s"
+    flight.ask(GOTO, **POINT | {"north_m": 403.0}, speed_m_s=1.0)
+    assert outcome_of(Order(GOTO, POINT), flight.mission) == "flies to 403, -2, -4: 400 m, 13 min"
+    assert outcome_of(Order("hold"), flight.mission) == ""
 
 
 def test_a_point_outside_of_the_flight_volume_is_refused_with_its_reason() -> None:

@@ -176,9 +176,10 @@ def test_own_modules_are_found_beside_the_configuration_also_from_the_run_folder
         (("controller.kind=own_pidd:Pid",), ("own_pidd", "can't be imported", "own_folder")),
         (("controller.kind=own_pid:Pad",), ("own_pid has no class Pad",)),
         (("controller.kind=os:PathLike",), ("no class PathLike derived from",)),
-        (("controller.kind=dmpcc",), ("'dmpc'", "package.module:")),
+        (("controller.kind=dmpcc",), ("did you mean 'dmpc'?", "'package.module:Class'")),
+        (("mission.kind=figure8",), ("did you mean 'lemniscate'?", "'package.module:Class'")),
         (("controller.own.kp=-1",), ("controller.own.kp = -1", "greater than")),
-        (("controller.own.kq=1",), ("controller.own.kq = 1", "not permitted")),
+        (("controller.own.kpp=1",), ("controller.own.kpp = 1: unknown key; did you mean 'kp'?",)),
         (("separation.mode=guaranteed",), ("controller.kind = 'own_pid:Pid'", "best_effort")),
         (("agent.barrier.enabled=false",), ("agent.barrier.enabled = false", "set it to true")),
     ],
@@ -186,6 +187,15 @@ def test_own_modules_are_found_beside_the_configuration_also_from_the_run_folder
 def test_an_own_controller_that_can_not_fly_is_refused(overrides: tuple[str, ...], words: tuple[str, ...]) -> None:
     said = refusal(*overrides, path=EXAMPLE)
     assert [word for word in words if word not in said] == []
+
+
+def test_a_module_that_misses_another_is_not_looked_for_elsewhere(tmp_path: Path) -> None:
+    (tmp_path / "imports_numpyy.py").write_text("import numpyy")
+    (tmp_path / "own.toml").write_text('[mission]\nkind = "imports_numpyy:Own"\n')
+    said = refusal(path=tmp_path / "own.toml")
+    assert "imports_numpyy can't be imported: ModuleNotFoundError: No module named 'numpyy'" in said
+    assert "own_folder" not in said
+    assert "own_folder" in refusal("mission.kind=nowhere.at.all:Own")
 
 
 MISSION = """

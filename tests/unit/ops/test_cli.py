@@ -171,7 +171,9 @@ def test_answers_as_json_name_everybody_and_the_exit_code_stays(capsys: pytest.C
     ]
     with pytest.raises(MissionError, match="agent-1 refuses: it is in LAND; agent-2 did not answer"):
         orders.told("hold", "circle-1a", lambda: replies, as_json=True)
-    assert json.loads(capsys.readouterr().out) == {
+    printed = json.loads(capsys.readouterr().out)
+    assert [agent.pop("comes_to") for agent in printed["agents"]] == ["", "", ""]
+    assert printed == {
         "run": "circle-1a",
         "order": "hold",
         "agents": [
@@ -182,6 +184,28 @@ def test_answers_as_json_name_everybody_and_the_exit_code_stays(capsys: pytest.C
     }
     assert orders.told("hold", "circle-1a", lambda: replies[:1]) == 0
     assert capsys.readouterr().out == "hold: circle-1a\nagent-0 accepts, TRACK\n"
+
+
+def test_what_an_accepted_order_comes_to_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    answer = Answer("goto", 5, accepted=True, reason="flies to 1, 2, -3: 4.0 m, 6 s\x1b[2J")
+    replies = [Reply(agent=0, verb="goto", answer=answer, phase=Phase.TRACK)]
+    orders.told("goto", "circle-1a", lambda: replies)
+    assert capsys.readouterr().out.endswith("agent-0 accepts, TRACK; flies to 1, 2, -3: 4.0 m, 6 s\\x1b[2J\n")
+    orders.told("goto", "circle-1a", lambda: replies, as_json=True)
+    assert json.loads(capsys.readouterr().out)["agents"][0]["comes_to"].startswith("flies to 1, 2, -3")
+
+
+def test_far_is_an_argument_of_goto_only_where_it_is_said(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[Order] = []
+
+    def give(order: Order, *rest: object) -> int:
+        given.append(order)
+        return 0
+
+    monkeypatch.setattr(orders, "_give", give)
+    assert run("goto", "1", "1000,2,-3") == 0
+    assert run("goto", "1", "-1000,2,-3", "--far") == 0
+    assert [order.arguments.get("far") for order in given] == [None, 1.0]
 
 
 def test_every_verb_that_acts_on_a_launch_prints_json_too(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

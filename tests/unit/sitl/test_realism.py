@@ -95,7 +95,7 @@ def test_faults_of_a_configuration_happen_in_lockstep_and_are_logged(config: Con
         ("thrust_curve_01=1.5", "sitl.thrust_curve_01 = 1.5"),
         ("motor_tau_s=2", "sitl.motor_tau_s = 2"),
         ("drag_scale=-1", "sitl.drag_scale = -1"),
-        ("estimator=perfect", "sitl.estimator = 'perfect': input should be 'exact', 'gps' or 'external'"),
+        ("estimator=perfect", "input should be 'exact', 'gps', 'external', 'px4_gps' or 'px4_external'"),
         ("autopilot_kind=inav", "sitl.autopilot_kind = 'inav'"),
         ("speed=5", "agents fly on wall time"),
     ],

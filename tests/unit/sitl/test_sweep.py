@@ -12,6 +12,7 @@ from sitl.studies.sweep.command import main
 from sitl.studies.sweep.figures import FIGURES, Row, combinations
 from sitl.studies.sweep.flight import FlySweep
 from sitl.studies.sweep.points import Axis, Flight, flights_of, parse_axes, problems_of
+from swarmctl.config import load
 from swarmctl.errors import ConfigError
 
 RADIUS = "--set=separation.radius_m=0.9,0.95"
@@ -86,6 +87,24 @@ def test_every_impossible_combination_is_named_before_anything_flies(
     with pytest.raises(ConfigError, match="allowed: 100000"):
         flights_of([Axis("a", tuple(map(str, range(1000))))], 1, 1000)
     assert list(problems_of(flights_of([Axis("seed", ("1",))], 1, 1), None)) == []
+
+
+def test_duration_and_first_seed_are_options_as_of_simulate(
+    flown: list[Flight], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(tmp_path / "out", KIND, "--duration", "12", "--seed", "7", "--seeds", "2") == 0
+    assert {flight.seed for flight in flown} == {7, 8}
+    base = load(tmp_path / "out" / "config.toml")
+    assert (base.mission.duration_s, base.seed) == (12.0, 1), "other seeds go on in the same folder"
+    assert run(tmp_path / "out", KIND, "--duration", "12", "--seed", "9") == 0
+    assert {row["seed"] for row in rows_in(tmp_path / "out")} == {7, 8, 9}
+    assert run(tmp_path / "bad", KIND, "--duration", "-1") == 2
+    assert "mission.duration_s = -1" in capsys.readouterr().err
+    assert run(tmp_path / "bad", "--set=mission.duration_s=1,2", "--duration", "3") == 2
+    assert "the same in every flight by another option" in capsys.readouterr().err
+    for wrong in ("-1", "x", "2147483648"):
+        with pytest.raises(SystemExit):
+            run(tmp_path / "bad", KIND, f"--seed={wrong}")
 
 
 def test_a_sweep_goes_on_where_it_stopped_and_can_grow(flown: list[Flight], tmp_path: Path) -> None:

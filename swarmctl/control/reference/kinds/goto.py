@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +13,8 @@ from pydantic import Field
 from swarmctl.control.reference.goal_assignment import assigned_goals_ned_m
 from swarmctl.control.reference.kind import MissionKind, Place, mission_kind
 from swarmctl.control.reference.quintic import QuinticTrajectory, quintic_to
-from swarmctl.core.params import Vec3
+from swarmctl.core.goal import Goal
+from swarmctl.core.params import FARTHEST_M, Vec3
 from swarmctl.core.types import Sampled
 
 OUTER_DELAY_S_M = 0.5  # delay of arrival per metre that a place is farther out
@@ -21,6 +23,8 @@ OUTER_DELAY_S_M = 0.5  # delay of arrival per metre that a place is farther out
 @mission_kind("goto")
 class GotoParams(MissionKind):
     """Lets every agent fly smoothly to its goal and stay there, or around a goal that several share."""
+
+    synonyms: ClassVar[tuple[str, ...]] = ("goal", "goals")
 
     goals_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one for each agent, or a single one for all
     speed_m_s: float = Field(2.0, gt=0, le=20)  # approximate peak
@@ -33,13 +37,23 @@ class GotoParams(MissionKind):
         return False
 
     def reference(self, place: Place) -> Sampled:
-        starts = tuple(map(tuple, place.starts_ned_m.tolist()))
-        return _goal_flights(self, starts, place.apart_m, OUTER_DELAY_S_M)[place.agent].sample
+        return self._flight(place).sample
+
+    def goal(self, place: Place) -> Goal | None:
+        flight = self._flight(place)
+        return Goal(pos_ned_m=flight.to_ned_m, needs_s=flight.travel_s)
 
     def problems(self, agents: int) -> Iterator[str]:
         goals = len(self.goals_ned_m)
         if goals not in (1, agents):
             yield f"mission.goto.goals_ned_m: {goals} goals for swarm.agents = {agents}; list one each, or one for all"
+        far = [i for i, goal in enumerate(self.goals_ned_m) if max(map(abs, goal)) > FARTHEST_M]
+        if far:
+            yield f"mission.goto.goals_ned_m: goals {far} are more than {FARTHEST_M:g} m from the shared origin"
+
+    def _flight(self, place: Place) -> QuinticTrajectory:
+        starts = tuple(map(tuple, place.starts_ned_m.tolist()))
+        return _goal_flights(self, starts, place.apart_m, OUTER_DELAY_S_M)[place.agent]
 
 
 @lru_cache(maxsize=8)  # the goals of all agents are assigned at once, and each is asked for

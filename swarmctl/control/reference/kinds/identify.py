@@ -22,6 +22,7 @@ _STEP_DIRECTIONS = np.array(
 class IdentifyParams(MissionKind):
     """Describes steps about the own start, to and fro along each axis, as `swarmctl check --identify` flies them."""
 
+    has_own_verb: ClassVar[bool] = True
     jumps: ClassVar[bool] = True
 
     step_m: float = Field(2.0, gt=0.1, le=20)  # north, south, east, west

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from pydantic import Field
 
@@ -13,6 +15,8 @@ from swarmctl.core.types import Array, Sampled
 @mission_kind("lemniscate")
 class LemniscateParams(SharedReference):
     """Describes a figure-8 `center + (length sin wt, width sin 2wt, 0)`: one loop north of its centre, one south."""
+
+    synonyms: ClassVar[tuple[str, ...]] = ("figure8", "figure_8", "figure-8", "eight")
 
     center_ned_m: Vec3 = (0.0, 0.0, -1.5)  # where both loops meet, and where it begins
     length_m: float = Field(4.0, ge=0, le=1000)  # from the centre to the end of a loop, north

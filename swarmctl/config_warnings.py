@@ -1,0 +1,53 @@
+"""What is doubtful about a valid configuration, in words: it is flown, and may not be what was meant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from swarmctl.config import Config
+from swarmctl.control.reference.kinds.csv_table import CsvParams
+from swarmctl.core.types import Array
+
+_BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
+_AGENTS_SHOWN = 3
+_ZERO = np.zeros(1)
+
+
+def config_warnings(config: Config) -> list[str]:
+    """Return what is doubtful about a configuration that can be flown."""
+    unused = config.mission.unused_sections()
+    kind = config.mission.kind
+    found = [f"mission.{name} is set, mission.kind is {kind!r}: it is not flown" for name in unused]
+    return [*found, *_begin_elsewhere(config)]
+
+
+def warning_lines(config: Config) -> list[str]:
+    """Return the same as lines to print."""
+    return [f"warning: {text}" for text in config_warnings(config)]
+
+
+def _begin_elsewhere(config: Config) -> Iterator[str]:
+    """Yield whose own reference begins away from where the agent waits, so that it has to catch up with it.
+
+    References that agents share begin where they like.
+    """
+    starts_ned_m = np.array(config.starts_ned_m())
+    references = config.mission.references(starts_ned_m, config.separation.budget.planned_m)
+    found = []
+    for agent, (reference, start) in enumerate(zip(references, starts_ned_m, strict=True)):
+        begin = reference.sample(_ZERO)[0][0]
+        away_m = float(np.linalg.norm(begin - start))
+        if reference.fixed_in_time and not reference.jumps and away_m > _BEGINS_M:
+            places = f"{_words(begin)}, start {_words(start)}"
+            found.append(f"agent {agent}: the reference begins {away_m:.2f} m from its start (at {places})")
+    added = config.mission.kind == "csv" and config.mission.section(CsvParams).from_start
+    hint = "; mission.csv.from_start adds positions to the start: begin at 0, 0, 0" if added else ""
+    yield from (f"{text}{hint}" for text in found[:_AGENTS_SHOWN])
+    if len(found) > _AGENTS_SHOWN:
+        yield f"{len(found) - _AGENTS_SHOWN} more references begin away from the agents' starts"
+
+
+def _words(place: Array) -> str:
+    return ", ".join(f"{part:g}" for part in np.round(place, 2).tolist())
