@@ -106,7 +106,7 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')}, "
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
-        f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
+        f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} bus messages refused"
         + _refused_frames(comms)
         + _unresponsive(comms)
         + _reopened(comms)
