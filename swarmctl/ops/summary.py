@@ -103,7 +103,7 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         + (
             f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else ""
         ),
-        f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')}, "
+        f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')} from arming on, "
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
         f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} bus messages refused"

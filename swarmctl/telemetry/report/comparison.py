@@ -16,7 +16,7 @@ from swarmctl.telemetry.evaluation.referee import Rules, RunData
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.report.charts import Limit, Line, time_chart
 from swarmctl.telemetry.report.pages import render
-from swarmctl.telemetry.report.run_charts import RunCharts
+from swarmctl.telemetry.report.run_charts import IN_FLIGHT, RunCharts
 from swarmctl.telemetry.report.run_report import summary_rows
 from swarmctl.telemetry.report.svg import Figure
 
@@ -96,7 +96,7 @@ def _charts(runs: Sequence[JudgedRun], charts: Sequence[RunCharts]) -> Iterator[
     for name, curve in CURVES.items():
         worst = [_worst(chart, name, curve) for chart in charts]
         if any(len(line["x"]) for line in worst):
-            yield _chart(f"{curve.title}, {curve.worst} of all agents", runs, worst)
+            yield _chart(f"{curve.titled(IN_FLIGHT)}, {curve.worst} of all agents", runs, worst)
 
 
 def _chart(title: str, runs: Sequence[JudgedRun], lines: Sequence[Mapping[str, Array]], limits: Any = ()) -> Figure:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from swarmctl.config import Config, dump, load_recorded
+from swarmctl.core.tick_record import CURVES
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.verbs.folders import report
@@ -23,6 +24,7 @@ from swarmctl.telemetry.recording.run_files import load_run
 from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
 from swarmctl.telemetry.report import svg
 from swarmctl.telemetry.report.comparison import differences
+from swarmctl.telemetry.report.run_charts import RunCharts
 from tests.unit.telemetry.test_run_folder import flight, write_run
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -107,6 +109,22 @@ def test_goals_are_those_of_the_mission_that_an_operator_has_set_last(tmp_path: 
     report([directory])
     above = figures((directory / "report.html").read_text())["From above: north up, east right [m]"]
     assert re.findall(r">(goal[^<]*)</text>", above) == ["goal 0, 1", "goal 2"]
+
+
+def test_table_and_chart_count_the_same_deadline_misses(tmp_path: Path) -> None:
+    directory = finish(tmp_path / "late")
+    ticks = load_run(directory).ticks
+    for agent, rows in ticks.items():
+        begun = np.clip(np.arange(len(rows)) // 10, 0, 3) + np.where(rows["phase"] >= Phase.TRACK, agent, 0)
+        rows["deadline_misses"] = begun  # three before arming, and in flight as many as the agent's number
+        rows.tofile(directory / f"agent-{agent}.ticks")
+    finish_run(directory, Config().rules(), Outcome(outcome="completed"))
+    page = (directory / "report.html").read_text()
+    chart = RunCharts(load_run(directory), {"agents": 3}, None)
+    counted = [values for _, values in chart.curve_of_agents("deadline_misses", CURVES["deadline_misses"])]
+    assert [(values[0], values[-1]) for values in counted] == [(0, 0), (0, 1), (0, 2)]
+    assert "Deadline misses from arming on" in figures(page)
+    assert re.search(r"<td>deadline misses from arming on</td>\s*<td[^>]*>3 of \d+<", page)
 
 
 def test_every_colour_of_a_page_is_known_by_day_and_in_the_dark(folder: Path) -> None:
