@@ -84,7 +84,7 @@ def compare(directories: Sequence[Path], output: Path | None) -> Path:
 
 
 def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:
-    """Return five lines: outcome, separation, timing, solver and bus, folder."""
+    """Return five lines: outcome, separation, timing, solver and bus, folder; and one for each own controller."""
     violations = summary.get("violations") or []
     obstacles = _section(summary, "obstacles")
     timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
@@ -111,6 +111,10 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         + _unresponsive(comms)
         + _reopened(comms)
         + _deadlocks(summary),
+        *(
+            f"{printable(own['name'])} flew {own['flown_ticks']} of {own['mission_ticks']} mission ticks"
+            for own in summary.get("own_controllers") or ()
+        ),
         f"run folder {directory}",
     )
 

@@ -69,6 +69,12 @@ class _Deadlocks(msgspec.Struct):
     unresolved: _Count = 0
 
 
+class _OwnController(msgspec.Struct):
+    name: str
+    flown_ticks: _Count
+    mission_ticks: _Count
+
+
 class _Summary(msgspec.Struct):
     outcome: Outcome
     violations: list[str]
@@ -83,6 +89,7 @@ class _Summary(msgspec.Struct):
     duration_s: _Figure | None = None
     version: str = ""  # missing in older folders, as is the next
     deadlocks: _Deadlocks = msgspec.field(default_factory=_Deadlocks)
+    own_controllers: list[_OwnController] = []
 
 
 def decode_summary(content: bytes) -> dict[str, Any]:

@@ -119,6 +119,9 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     for name, key in (("tick time", "tick_ms"), ("solve time", "solve_ms")):
         values = " / ".join(_figure(timing[key][part], "", 2) for part in ("p50", "p99", "max"))
         yield SummaryRow(f"{name}, median / p99 / max", f"{values} ms", number=timing[key]["p50"])
+    for own in summary.get("own_controllers") or ():
+        flown = f"{own['flown_ticks']} of {own['mission_ticks']}"
+        yield SummaryRow(f"mission ticks flown by {own['name']}", flown, number=own["flown_ticks"])
     solver, comms = summary["solver"], summary["comms"]
     yield SummaryRow(f"solver ({solver['name']}) failures", str(solver["failed"]))
     yield SummaryRow("plans refused by their certificate", str(solver["not_certified"]))
