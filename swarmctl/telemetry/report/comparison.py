@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from swarmctl.core.text import told_apart
 from swarmctl.core.tick_record import CURVES, Curve
 from swarmctl.core.types import Array
 from swarmctl.files import replace_text
@@ -75,7 +76,7 @@ def differences(texts: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
     for key in sorted({key for tree in trees for key in tree}):
         values = [tree.get(key, "") for tree in trees]
         if len(set(values)) > 1:
-            yield key, [value if len(value) <= _MOST_TEXT else f"{value[:_MOST_TEXT]} ..." for value in values]
+            yield key, told_apart(values, _MOST_TEXT)
 
 
 def _flat(prefix: str, tree: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

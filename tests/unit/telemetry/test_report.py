@@ -179,7 +179,7 @@ def test_figures_are_drawn_as_png_where_it_is_asked_for(
     for color in (agent_rgb(0), agent_rgb(1), (255, 255, 255)):
         assert (image == color).all(axis=2).sum() > 100, color
     monkeypatch.setitem(sys.modules, "resvg_py", None)
-    with pytest.raises(StartError, match=r"pip install 'swarmctl\[png\]'"):
+    with pytest.raises(StartError, match=r"pip install '\.\[png\]'"):
         report([copied], png=True)
 
 
@@ -211,6 +211,16 @@ def test_runs_are_set_beside_each_other(folder: Path, shared: Path, capsys: pyte
 def test_only_what_differs_in_the_configuration_is_listed() -> None:
     texts = ["a = 1\n[b]\nc = [1, 2]\nd = 'x'\n", "a = 1\n[b]\nc = [1, 3]\nd = 'x'\ne = true\n"]
     assert list(differences(texts)) == [("b.c", ["[1, 2]", "[1, 3]"]), ("b.e", ["", "True"])]
+
+
+def test_of_long_values_that_part_is_listed_in_which_they_differ() -> None:
+    rows = [f"rows = {[[float(t), 0.0] for t in range(1000)] + [[float(end), 1.0]]}\n" for end in (1, 2)]
+    ((key, (first, second)),) = differences(rows)
+    assert key == "rows"
+    assert "[1.0, 1.0]" in first and "[2.0, 1.0]" in second
+    assert first.startswith("... ") and max(len(first), len(second)) < 130
+    ((_, (many, none, absent)),) = differences([rows[0], "rows = []\n", ""])
+    assert many.startswith("[[0.0, 0.0], [1.0") and many.endswith(" ...") and (none, absent) == ("[]", "")
 
 
 def test_what_can_not_be_compared_is_refused(folder: Path, tmp_path: Path) -> None:
