@@ -22,7 +22,7 @@ def told_apart(values: Sequence[str], most: int) -> list[str]:
     texts = [value for value in values if value]
     characters = enumerate(zip(*texts, strict=False))
     differ = next((k for k, found in characters if len(set(found)) > 1), min(map(len, texts), default=0))
-    begin = max(0, differ - most // 4) if max(map(len, texts), default=0) > most else 0
+    begin = max(0, differ - most // 4) if len(texts) > 1 and max(map(len, texts)) > most else 0
     return [
         f"{'... ' if begin and value else ''}{value[begin : begin + most]}{' ...' if len(value) > begin + most else ''}"
         for value in values

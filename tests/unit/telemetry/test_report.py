@@ -221,6 +221,8 @@ def test_of_long_values_that_part_is_listed_in_which_they_differ() -> None:
     assert first.startswith("... ") and max(len(first), len(second)) < 130
     ((_, (many, none, absent)),) = differences([rows[0], "rows = []\n", ""])
     assert many.startswith("[[0.0, 0.0], [1.0") and many.endswith(" ...") and (none, absent) == ("[]", "")
+    ((_, (alone, _)),) = differences([rows[0], ""])
+    assert alone.startswith("[[0.0, 0.0], [1.0")
 
 
 def test_what_can_not_be_compared_is_refused(folder: Path, tmp_path: Path) -> None:
