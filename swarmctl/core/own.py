@@ -6,6 +6,7 @@ import importlib
 import importlib.metadata
 import re
 import traceback
+from collections import deque
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any
@@ -36,8 +37,13 @@ def raised_at(error: BaseException, module: str) -> str:
 
 
 def traced(error: BaseException) -> str:
-    """Return the innermost frames of what somebody else's code has raised, as Python shows them."""
-    return "".join(traceback.format_exception(error, limit=-_FRAMES))[-_TRACED:]
+    """Return the innermost frames of what somebody else's code has raised, and what it was.
+
+    Lines of source, which Python would show, are read from a disk, for which a tick must not wait.
+    """
+    frames = deque(traceback.walk_tb(error.__traceback__), maxlen=_FRAMES)
+    shown = [f'File "{frame.f_code.co_filename}", line {line}, in {frame.f_code.co_name}' for frame, line in frames]
+    return "\n".join([*shown, in_words(error)])[-_TRACED:]
 
 
 class OwnError(Exception):
