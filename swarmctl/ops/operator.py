@@ -137,7 +137,7 @@ def _flying(launch: RunningLaunch) -> RunningLaunch:
 
 @contextmanager
 def joined(launch: RunningLaunch) -> Iterator[Bus]:
-    """Join the bus of a launch as its operator.
+    """Join the bus of a launch as its operator; what is not answered because it is ending is told so.
 
     Raises:
         StartError: it does not answer, or is ending.
@@ -154,13 +154,11 @@ def joined(launch: RunningLaunch) -> Iterator[Bus]:
             utc_us=utc_us,
             connect_timeout_ms=3000,
         )
+        with contextlib.closing(bus):
+            yield bus
     except StartError:
         refuse_ending(launch)
         raise
-    try:
-        yield bus
-    finally:
-        bus.close()
 
 
 def list_keepers(identity: OwnIdentity | None) -> tuple[str, ...]:

@@ -17,9 +17,10 @@ from swarmctl.config import Config
 from swarmctl.core.operator_verbs import Order
 from swarmctl.errors import StartError
 from swarmctl.ops import launch as launching
-from swarmctl.ops import operator, order_delivery
+from swarmctl.ops import obstacle_list, operator, order_delivery
 from swarmctl.ops.launch import Launcher, LaunchOptions, SwarmPart, judged
 from swarmctl.ops.launch_result import LaunchResult
+from swarmctl.ops.obstacle_list import read_obstacles
 from swarmctl.ops.operator import RunningLaunch, announce, find_launch, joined, read_statuses
 from swarmctl.ops.order_delivery import deliver
 from swarmctl.ops.preflight import ReservedPorts
@@ -74,6 +75,7 @@ def test_a_verb_that_finds_a_launch_in_its_last_moment_says_that_it_is_ending(
 ) -> None:
     monkeypatch.setattr(operator, "ANSWER_S", 0.0)
     monkeypatch.setattr(order_delivery, "ANSWER_S", 0.0)
+    monkeypatch.setattr(obstacle_list, "ANSWER_S", 0.0)
     for bus in (nobody, no_router):
         monkeypatch.setattr(operator, "join_bus", bus)
         announce(launch)
@@ -85,6 +87,8 @@ def test_a_verb_that_finds_a_launch_in_its_last_moment_says_that_it_is_ending(
             read_statuses(launch)
         with pytest.raises(StartError, match=ENDING):
             deliver(launch, Order("hold"), [])
+        with pytest.raises(StartError, match=ENDING):
+            read_obstacles(launch)
     announce(launch)
     with pytest.raises(StartError, match="no router answers"), joined(launch):
         pass
