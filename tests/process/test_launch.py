@@ -25,6 +25,7 @@ from swarmctl.core.types import Phase
 from swarmctl.mavlink.signing.key_file import write_new_key
 from swarmctl.mavlink.signing.refusals import OLD, REPLAYED
 from swarmctl.ops.cli import main
+from swarmctl.ops.operator import LAUNCH_FILE
 from swarmctl.ops.processes import wants_realtime
 from swarmctl.process_priority import is_realtime_permitted
 from swarmctl.telemetry.recording.run_files import read_parquet
@@ -63,6 +64,10 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     assert "bus " in lines[1]
     assert str(launched.run_dir) in lines[2]
     assert any("agent-2  TRACK" in line for line in lines)
+    armed = [line for line in lines if "  ARM" in line or "  TAKEOFF" in line]
+    assert armed and not any("waits for" in line for line in armed), "who does not wait does not say so"
+    assert "GPS_GLOBAL_ORIGIN" not in launched.text(), "that an origin is asked for too early is no alert"
+    assert json.loads((launched.run_dir / LAUNCH_FILE).read_bytes())["ending"], "verbs have said so meanwhile"
     assert any(line.startswith("completed, summed mean tracking error") for line in lines[-6:])
     summary = launched.summary()
     assert summary["outcome"] == "completed"
