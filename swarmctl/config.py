@@ -7,6 +7,7 @@ sections checked (`config_constraints`), and writes the resolved copy. It opens 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -64,6 +65,7 @@ from swarmctl.simulator_config import EVERY_VEHICLE, OriginParams, SimulatorConf
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 
 NO_VALUES: Mapping[str, Any] = MappingProxyType({})
+_NUMBERS = re.compile(r"\[\n((?: +[-+.\w]+,\n)+) *\]")  # an array of numbers as tomli_w writes it: one on each line
 _RENAMED = {  # keys of versions before 0.2
     "agent.commit.bias_rad": "agent.commit.right_of_way_rad",
     "agent.commit.share_01": "agent.commit.tilt_fraction_01",
@@ -276,8 +278,9 @@ def own_identity(config: Config, name: str) -> OwnIdentity:
 
 
 def dump(config: Config) -> str:
-    """Return the resolved configuration as TOML, which `load` reads back to the same tree."""
-    return tomli_w.dumps(config.model_dump(exclude_none=True))
+    """Return the resolved configuration as TOML, which `load` reads back to the same tree; vectors are on one line."""
+    written = tomli_w.dumps(config.model_dump(exclude_none=True))
+    return _NUMBERS.sub(lambda found: f"[{' '.join(found[1].split()).removesuffix(',')}]", written)
 
 
 def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """Theoretical lower bounds of the errors on the thesis' trajectories: optimal control of its own model.
 
-    pip install 'swarmctl[bounds]'
+    pip install '.[bounds]'
     python tools/lower_bound.py
 
 They are the `least` figures of `swarmctl reproduce`. The model is a point mass under thrust, whose tilt follows its

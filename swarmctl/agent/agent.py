@@ -8,6 +8,7 @@ tell each other; each part is a module of the package that is named after its st
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 from swarmctl.agent.components import (
     make_controllers,
@@ -80,7 +81,8 @@ class Agent:
         self._state_machine = make_state_machine(setup)
         self._mission = self._state_machine.mission
         self._vehicle_watch = VehicleWatch(ports, alerts)
-        self._controller_watch = ControllerWatch(ports.note)
+        own = setup.controller.kind if setup.controller.is_own else ""
+        self._controller_watch = ControllerWatch(own, ports.note)
         self._deadlines = DeadlineWatch(setup.params.overload, setup.params.rate_hz, alerts, ports.note)
         self._orders = OperatorOrders(setup, ports, self._world_model, self._state_machine, alerts=alerts)
         self._start_conditions = StartConditions(setup, self._mission, alerts)
@@ -146,6 +148,11 @@ class Agent:
     def refused_frames(self) -> dict[str, int]:
         """Number of the vehicle's MAVLink frames refused so far, by reason."""
         return dict(self._ports.autopilot.refusals.by_reason)
+
+    @property
+    def own_controller(self) -> dict[str, Any]:
+        """Name of an own controller, and how many ticks of missions it has flown; empty for a built-in one."""
+        return self._controller_watch.summary
 
     @property
     def commits_refused(self) -> int | None:
@@ -250,7 +257,9 @@ class Agent:
             disturbance_ned_m_s2=disturbance_ned_m_s2,
             battery_01=self._ports.autopilot.health.battery_01,
         )
-        return self._modes.flown(state, planning, disturbance_ned_m_s2)
+        flown = self._modes.flown(state, planning, disturbance_ned_m_s2)
+        self._controller_watch.count(self._mission.phase, plan, flown)
+        return flown
 
     def _act(self, now_us: int, flown: Plan | None, planning: PlanningResult) -> AttitudeSetpoint | None:
         """Send the setpoint of the tick; return it, None if none has left."""

@@ -161,6 +161,8 @@ def _fly(
         summary = {"sent": flown.sent, "rejected": flown.rejected, "lost": recorder.lost}
         recorder.event("bus_summary", clock.now_us(), clock.utc_us(), **summary)
         recorder.event("link_summary", clock.now_us(), clock.utc_us(), refused=flown.refused_frames)
+        if flown.own_controller:
+            recorder.event("controller_summary", clock.now_us(), clock.utc_us(), **flown.own_controller)
         link.close()
         transport.close()
         recorder.close()

@@ -6,12 +6,16 @@ import difflib
 import importlib
 import importlib.metadata
 import re
+import traceback
+from collections import deque
 from dataclasses import dataclass
+from pathlib import PurePath
 from typing import Any
 
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+_FRAMES, _TRACED = 8, 4000  # of a traceback, and its characters
 _NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 
@@ -21,6 +25,26 @@ def in_words(error: BaseException) -> str:
         return f"{type(error).__name__}: {error}"
     except (Exception, SystemExit):
         return f"{type(error).__name__}, which can't be shown"
+
+
+def raised_at(error: BaseException, module: str) -> str:
+    """Return "file:line" of where a module has raised, or has called what did; of another module if it is in none."""
+    frames = [(frame.f_globals.get("__name__"), frame, line) for frame, line in traceback.walk_tb(error.__traceback__)]
+    inside = [(frame, line) for name, frame, line in frames if name == module] or [found[1:] for found in frames]
+    if not inside:
+        return "no traceback"
+    frame, line = inside[-1]
+    return f"{PurePath(frame.f_code.co_filename).name}:{line}"
+
+
+def traced(error: BaseException) -> str:
+    """Return the innermost frames of what somebody else's code has raised, and what it was.
+
+    Lines of source, which Python would show, are read from a disk, for which a tick must not wait.
+    """
+    frames = deque(traceback.walk_tb(error.__traceback__), maxlen=_FRAMES)
+    shown = [f'File "{frame.f_code.co_filename}", line {line}, in {frame.f_code.co_name}' for frame, line in frames]
+    return "\n".join([*shown, in_words(error)])[-_TRACED:]
 
 
 class OwnError(Exception):

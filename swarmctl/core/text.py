@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 MOST_SHOWN = 500
 
 
@@ -13,6 +15,18 @@ def printable(text: str, most: int = MOST_SHOWN) -> str:
     half = most // 2
     short = text if len(text) <= most else f"{text[:half]} ... {text[-half:]}"
     return "".join(c if c.isprintable() else _escaped(c) for c in short)
+
+
+def told_apart(values: Sequence[str], most: int) -> list[str]:
+    """Return values that differ, of long ones `most` characters from shortly before where they begin to."""
+    texts = [value for value in values if value]
+    characters = enumerate(zip(*texts, strict=False))
+    differ = next((k for k, found in characters if len(set(found)) > 1), min(map(len, texts), default=0))
+    begin = max(0, differ - most // 4) if len(texts) > 1 and max(map(len, texts)) > most else 0
+    return [
+        f"{'... ' if begin and value else ''}{value[begin : begin + most]}{' ...' if len(value) > begin + most else ''}"
+        for value in values
+    ]
 
 
 def printable_lines(text: str) -> str:

@@ -91,6 +91,10 @@ class Curve:
     is_slow: bool = False  # in the view its newest value is enough
     is_share: bool = False  # the view draws it from 0 to 1, whatever its values are
 
+    def titled(self, since: str) -> str:
+        """Return the title; that of a count says since when it is counted."""
+        return f"{self.title} {since}" if self.is_count else self.title
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Column(StoredColumn):
@@ -125,7 +129,7 @@ _ROLL = "plot/att/{}/roll"
 _THRUST = "plot/att/{}/thrust"
 _SOLVE = Curve(title="Solve time [ms]", where=lambda rows: rows["iterations"] > 0)
 _TICK = Curve(title="Tick time, listen to send [ms]")
-_MISSES = Curve(title="Deadline misses so far", is_count=True, is_slow=True)
+_MISSES = Curve(title="Deadline misses", is_count=True, is_slow=True)
 _STALENESS = Curve(title="Plan staleness, oldest of the peers' [ms]", page="swarm")
 _BATTERY = Curve(title="Battery [0..1]", page="swarm", worst="smallest", is_slow=True, is_share=True)
 _TYPES = "in `swarmctl/core/types.py`"
@@ -314,7 +318,7 @@ COLUMNS = (
     Column(
         name="deadline_misses",
         dtype=_U4,
-        text="deadlines missed so far, skipped ticks included",
+        text="deadlines missed since the agent began, skipped ticks included; the verdict counts from arming on",
         value=lambda tick: tick.deadline_misses,
         formerly="late_ticks",
         view=_MISSES,

@@ -183,6 +183,8 @@ class Plan:
     terminal_gap_m: float = 0.0  # violation of the softened terminal condition
     failure: str = ""  # why the controller that was to make it did not, and another one did
     suspended: bool = False  # that controller is not asked any more
+    traceback: str = ""  # of what it has raised, where that is not yet told
+    by_own: bool = False  # an own controller has made it
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,6 +37,13 @@ class CommandResult:
     ok: bool
     text: str
 
+    @property
+    def asked(self) -> str:
+        """Return what was requested, with the parameter or message that it was about."""
+        command = self.command
+        kind = mavlink.mavlink_map.get(command.number) if command.verb in (Verb.RATE, Verb.MESSAGE) else None
+        return f"{command.verb.value} {command.name if kind is None else kind.msgname}".rstrip()
+
 
 class CommandPort:
     """Executes commands one after the other, repeats each until acknowledged, and sends the agent's heartbeat.
@@ -95,7 +102,7 @@ class CommandPort:
             if message.result == _IN_PROGRESS:
                 self._tries = 0
             else:
-                self._finish(message.result == 0, f"result {message.result}")
+                self._finish(message.result == 0, _in_words(message.result))
         elif kind == "PARAM_VALUE" and current.name and message.param_id == current.name:
             self._compare(current, self._spoken, message)
         elif kind == "PARAM_ERROR" and current.name and message.param_id == current.name:
@@ -153,3 +160,9 @@ class CommandPort:
             return mavlink.MAVLink_param_set_message(self._target, 1, command.name.encode(), value, kind)
         padded = (*asked.params, *(0.0,) * (7 - len(asked.params)))
         return mavlink.MAVLink_command_long_message(self._target, 1, asked.command, self._tries - 1, *padded)
+
+
+def _in_words(result: int) -> str:
+    """Return a MAV_RESULT in words; an unknown one as a number."""
+    known = mavlink.enums["MAV_RESULT"].get(result)
+    return f"result {result}" if known is None else known.name.removeprefix("MAV_RESULT_").lower().replace("_", " ")

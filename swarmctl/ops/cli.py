@@ -50,7 +50,9 @@ Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a configuration key; repeatable.")
 ]
 NewRunDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder to create; default runs/<UTC>-<name>.")]
-View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")]
+View = Annotated[
+    bool | None, typer.Option("--view/--no-view", help="Open the viewer window, or none; recorded either way.")
+]
 WebPage = Annotated[
     bool, typer.Option("--web", help="Serve the view to browsers of this computer; no window, unless --view.")
 ]

@@ -26,6 +26,7 @@ from swarmctl.config import Config, dump
 from swarmctl.config_warnings import warning_lines
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text
+from swarmctl.ops.launch_result import LaunchResult
 from swarmctl.ops.operator import RunningLaunch, announce, list_keepers, process_start_s, utc_us, withdraw
 from swarmctl.ops.preflight import LOOPBACK, ReservedPorts, inspect
 from swarmctl.ops.processes import (
@@ -100,7 +101,15 @@ def launch_part(config: Config, options: LaunchOptions, part: SwarmPart) -> int:
             result = FlightSupervisor(config, services, services.display).fly(lambda: stop.count)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
     # From here on Ctrl-C acts as usual: nothing is left to land.
-    violated = sum_up(config, services.context.directory, result, services.display.print_line)
+    return judged(config, services, result)
+
+
+def judged(config: Config, services: Launcher, result: LaunchResult) -> int:
+    """Judge the run folder of services that have stopped; return the exit code. Verbs find the launch until then."""
+    try:
+        violated = sum_up(config, services.context.directory, result, services.display.print_line)
+    finally:
+        withdraw()
     return result.exit_code(violated)
 
 
@@ -120,13 +129,16 @@ def started(config: Config, options: LaunchOptions, part: SwarmPart) -> Iterator
         reserved.release()
         raise
     services = Launcher(config, options, reserved, directory, part=part)
-    grace_s = _LAND_S  # after a failure from here on, agents still get time to land
     try:
         services.start()
         yield services
-        grace_s = 0.0  # every agent has ended
+    except BaseException:
+        services.stop(_LAND_S)  # agents still get time to land
+        withdraw()
+        raise
+    else:
+        services.stop(0.0)  # every agent has ended
     finally:
-        services.stop(grace_s)
         services.display.close()
 
 
@@ -215,13 +227,13 @@ class Launcher(Services):
         agents = [child for name, child in self.children.items() if name.startswith(agent_name(0)[:-1])]
         others = [child for child in self.children.values() if child not in router + agents]
         end_all(agents, agents_grace_s)
+        self.announce("", ending=True)
         end_all(others, _STOP_S)
         if self.bus is not None:
             self.bus.close()
         end_all(router, _ROUTER_STOP_S)
         self._reserved.release()
         shutil.rmtree(self._socket_dir, ignore_errors=True)
-        withdraw()
         self.log.write("stopped", exit_codes={name: child.poll() for name, child in self.children.items()})
 
     def recover(self, agent: int) -> Child:
@@ -238,8 +250,8 @@ class Launcher(Services):
         (command,) = agent_commands(self._config, context, *ends, config_path=config_path)
         return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
-    def announce(self, view: str) -> None:
-        """Publish this launch to the operator's commands."""
+    def announce(self, view: str, *, ending: bool = False) -> None:
+        """Publish this launch to the operator's commands, or that it is ending."""
         context = self.context
         start_s, pid = process_start_s()
         announce(
@@ -253,6 +265,7 @@ class Launcher(Services):
                 view,
                 context.identity,
                 __version__,
+                ending,
             )
         )
 

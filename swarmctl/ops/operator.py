@@ -49,6 +49,7 @@ class RunningLaunch(msgspec.Struct, frozen=True):
     view: str = ""  # address of the live view; "" without one
     identity: OwnIdentity | None = None  # as which operators speak here; None: a launch on one computer
     version: str = ""  # of the swarmctl that flies
+    ending: bool = False  # nobody answers any more; its report is still written
 
 
 def announce(launch: RunningLaunch) -> None:
@@ -78,19 +79,20 @@ def find_launch(run: str | None) -> RunningLaunch:
     """Return the running launch that is chosen by its name or run folder, or the only one of this user.
 
     Raises:
-        StartError: there is none.
+        StartError: there is none, or it is ending.
         ConfigError: there are several, and none of them is chosen.
     """
     if run is not None and (Path(run) / LAUNCH_FILE).exists():
         launch = _read(Path(run) / LAUNCH_FILE)
         if launch is None or not _runs(launch):
             raise StartError(f"--run {run}: no launch runs there. See what does with: swarmctl status")
-        return launch
+        return _flying(launch)
     running = running_launches()
     found = [launch for launch in running if run is None or launch.run.startswith(run)]
     found = [launch for launch in found if launch.run == run] or found
+    found = [launch for launch in found if not launch.ending] or found
     if len(found) == 1:
-        return found[0]
+        return _flying(found[0])
     if found:
         names = "\n".join(f"  {launch.run}  {launch.agents} agents  {launch.run_dir}" for launch in found)
         raise ConfigError("--run", [f"{len(found)} launches run, choose one by its name or folder:\n{names}"])
@@ -113,24 +115,50 @@ def running_launches() -> list[RunningLaunch]:
     return sorted(running.values(), key=lambda launch: launch.started_s, reverse=True)
 
 
+def refuse_ending(launch: RunningLaunch) -> None:
+    """Check that a launch which does not answer, or not fully, has not begun to end since it was found.
+
+    Raises:
+        StartError: it has.
+    """
+    _flying(_read(Path(launch.run_dir) / LAUNCH_FILE) or launch)
+
+
+def _flying(launch: RunningLaunch) -> RunningLaunch:
+    """Return a launch as it is.
+
+    Raises:
+        StartError: it is ending.
+    """
+    if launch.ending:
+        raise StartError(f"{launch.run} is ending: nobody answers any more, it writes its report to {launch.run_dir}")
+    return launch
+
+
 @contextmanager
 def joined(launch: RunningLaunch) -> Iterator[Bus]:
-    """Join the bus of a launch as its operator."""
+    """Join the bus of a launch as its operator; what is not answered because it is ending is told so.
+
+    Raises:
+        StartError: it does not answer, or is ending.
+    """
     senders = [agent_name(agent) for agent in range(launch.agents)]
-    bus = join_bus(
-        launch.bus,
-        launch.run,
-        OPERATOR if launch.identity is None else launch.identity.name,
-        {STATUS: senders, ANSWER: senders, OBSTACLES: list_keepers(launch.identity)},
-        identity=launch.identity,
-        max_age_us=FOR_OPERATORS_US,
-        utc_us=utc_us,
-        connect_timeout_ms=3000,
-    )
     try:
-        yield bus
-    finally:
-        bus.close()
+        bus = join_bus(
+            launch.bus,
+            launch.run,
+            OPERATOR if launch.identity is None else launch.identity.name,
+            {STATUS: senders, ANSWER: senders, OBSTACLES: list_keepers(launch.identity)},
+            identity=launch.identity,
+            max_age_us=FOR_OPERATORS_US,
+            utc_us=utc_us,
+            connect_timeout_ms=3000,
+        )
+        with contextlib.closing(bus):
+            yield bus
+    except StartError:
+        refuse_ending(launch)
+        raise
 
 
 def list_keepers(identity: OwnIdentity | None) -> tuple[str, ...]:
@@ -160,9 +188,16 @@ def view_address(launch: RunningLaunch) -> str:
 
 
 def read_statuses(launch: RunningLaunch) -> dict[int, StatusMessage]:
-    """Return the newest status of every agent that publishes one in time, by agent."""
+    """Return the newest status of every agent that publishes one in time, by agent.
+
+    Raises:
+        StartError: the launch is ending.
+    """
     with joined(launch) as bus:
-        return _statuses(bus, range(launch.agents), ANSWER_S)
+        statuses = _statuses(bus, range(launch.agents), ANSWER_S)
+    if len(statuses) < launch.agents:
+        refuse_ending(launch)
+    return statuses
 
 
 def watch_statuses(launch: RunningLaunch, every_s: float) -> Iterator[dict[int, StatusMessage]]:

@@ -20,7 +20,7 @@ from swarmctl.core.operator_verbs import OPERATOR_VERBS, PEER, Answer, Order
 from swarmctl.core.text import printable
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.ops.operator import ANSWER_S, REPEAT_S, RunningLaunch, joined
+from swarmctl.ops.operator import ANSWER_S, REPEAT_S, RunningLaunch, joined, refuse_ending
 
 _POLL_S = 0.02
 _MOST_MESSAGES = 32  # of one repetition, so that they fit into an agent's ring
@@ -194,7 +194,7 @@ def deliver(
 
     Raises:
         ConfigError: there is no such agent.
-        StartError: the bus can't be joined.
+        StartError: the bus can't be joined, or the launch is ending and nobody is left to answer.
     """
     asked = addressed(launch, order, agents)
     delivery = OrderDelivery(order, asked, everybody=len(asked) == launch.agents)
@@ -210,7 +210,10 @@ def deliver(
             time.sleep(_POLL_S)
             delivery.receive(bus, time.time_ns() // 1000)
         _wait_for_phases(delivery, bus)
-    return delivery.replies()
+    replies = delivery.replies()
+    if not any(reply.answer for reply in replies):
+        refuse_ending(launch)
+    return replies
 
 
 def _wait_for_phases(delivery: OrderDelivery, bus: Bus) -> None:

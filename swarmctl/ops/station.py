@@ -24,11 +24,10 @@ from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.bus_report import BusReport
 from swarmctl.ops.host import refuse_unidentified, shared_run_name
-from swarmctl.ops.launch import LaunchOptions, SwarmPart, started
+from swarmctl.ops.launch import LaunchOptions, SwarmPart, judged, started
 from swarmctl.ops.launch_result import LaunchResult
 from swarmctl.ops.processes import ROUTER, VIEWER
 from swarmctl.ops.status_table import AgentView, Display, tell
-from swarmctl.ops.summary import sum_up
 from swarmctl.ops.viewer_watch import ViewerWatch
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
@@ -71,8 +70,7 @@ def run_station(config: Config, options: LaunchOptions) -> int:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
     interrupted = bool(stop.count) or watch.was_stopped
     result = LaunchResult(problems=watch.problems, interrupted=interrupted, has_armed=True)
-    violated = sum_up(config, services.context.directory, result, services.display.print_line)
-    return result.exit_code(violated)
+    return judged(config, services, result)
 
 
 class SwarmWatch:

@@ -86,7 +86,7 @@ def compare(directories: Sequence[Path], output: Path | None) -> Path:
 
 
 def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:
-    """Return five lines: outcome, separation, timing, solver and bus, folder."""
+    """Return five lines: outcome, separation, timing, solver and bus, folder; and one for each own controller."""
     violations = summary.get("violations") or []
     obstacles = _section(summary, "obstacles")
     timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
@@ -106,14 +106,18 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         + (
             f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else ""
         ),
-        f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')}, "
+        f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')} from arming on, "
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
-        f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
+        f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} bus messages refused"
         + _refused_frames(comms)
         + _unresponsive(comms)
         + _reopened(comms)
         + _deadlocks(summary),
+        *(
+            f"{printable(own['name'])} flew {own['flown_ticks']} of {own['mission_ticks']} mission ticks"
+            for own in summary.get("own_controllers") or ()
+        ),
         f"run folder {directory}",
     )
 

@@ -20,6 +20,8 @@ class ViewerWatch:
 
     def __init__(self, child: Child | None, tell: Callable[..., None], publish: Callable[[str], None]) -> None:
         self._child, self._tell, self._publish = child, tell, publish
+        argv = () if child is None else child.argv
+        self._hint = "" if {"--view", "--web"} & {*argv} else " (no window; open one with: swarmctl view)"
         self._awaited = [] if child is None else [_ADDRESS, *([_PAGE] if "--web" in child.argv else [])]
         self._is_frozen = False
 
@@ -41,7 +43,7 @@ class ViewerWatch:
         """Tell the address that a line says."""
         url = line.split(" ", 1)[1]
         if self._awaited.pop(0) == _ADDRESS:
-            self._tell("viewer_ready", f"view {url}", url=url)
+            self._tell("viewer_ready", f"view {url}{self._hint}", url=url)
             self._publish(url)
         else:
             self._tell("page_ready", f"open in a browser: {url}", url=url)

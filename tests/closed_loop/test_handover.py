@@ -186,7 +186,9 @@ def test_after_a_reboot_in_flight_nothing_is_armed_again_and_the_outcome_says_wh
     since = flight.run.logs[0].events[asked_before:]
     verbs = [event["verb"] for event in since if event["event"] == "command"]
     assert not {"arm", "external", "takeoff"} & set(verbs)
-    assert {"rate", "param_int COM_OBL_RC_ACT", "message"} <= set(verbs), "set up again, or set back"
+    assert {"rate ODOMETRY", "param_int COM_OBL_RC_ACT", "message GPS_GLOBAL_ORIGIN"} <= set(verbs), (
+        "set up again, or set back"
+    )
     assert (flight.agent.finished, flight.agent.outcome) == (True, REBOOTED)
 
 

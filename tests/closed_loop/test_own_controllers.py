@@ -5,6 +5,8 @@ Two agents change places head-on. Each bad controller flies well until they appr
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -81,9 +83,22 @@ def test_controllers_that_fail_are_caught_and_vehicles_brought_to_rest(told: dic
         said = f"controller tests.benches.misbehaving:{controller} {why}"
         assert any(said in alert for alert in alerts)
         assert said in failures(flight, agent)[-1]
+        events = flight.lockstep.logs[agent].events
+        traces = [event["traceback"] for event in events if event["event"] == "controller_raised"]
+        if controller == "Raising":
+            (line,) = re.findall(
+                r"ZeroDivisionError: division by zero \(misbehaving\.py:(\d+)\)$", failures(flight, agent)[-1]
+            )
+            (trace,) = traces  # of twenty-five times
+            assert f'misbehaving.py", line {line}, in _bad' in trace
+        else:
+            assert traces == []
         assert flight.modes(agent, Phase.TRACK) == {Mode.TRACKING}, "there always was a certified plan"
         pilot = lockstep.agents[agent]
         assert pilot is not None
+        counts = pilot.own_controller
+        assert counts["controller"] == f"tests.benches.misbehaving:{controller}"
+        assert 0 < counts["flown_ticks"] < counts["mission_ticks"], "it flew well for a while"
         ended = said if controller != "Straight" else "completed"
         assert pilot.outcome.startswith(ended), "what is not asked any more ends the mission, and is named"
 
@@ -101,6 +116,11 @@ def test_every_example_flies(name: str, rmse_m: float, duration_s: int) -> None:
         late = ticks["mission_t_s"] > 1.0
         assert float(np.sqrt(np.mean(np.sum(error[late] ** 2, axis=1)))) <= rmse_m
         assert failures(flight, agent) == [], "it flies itself"
+        pilot = flight.lockstep.agents[agent]
+        assert pilot is not None
+        counts, tracked = pilot.own_controller, len(ticks) + 1  # the last tick of TRACK begins the next phase
+        own = {"controller": flight.config.controller.kind, "flown_ticks": tracked, "mission_ticks": tracked}
+        assert counts == (own if flight.config.controller.is_own else {})
 
 
 SWAPPED = "mission.own.formations=[{slots_ned_m=[[2.0,1.0,-3.0],[2.0,-1.0,-3.0]]}]"  # agent 0 waits on the other side

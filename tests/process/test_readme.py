@@ -221,6 +221,9 @@ def test_own_reference_and_own_controller_are_launched(tmp_path: Path) -> None:
     assert flown.controller.is_own and flown.mission.kind == "csv"
     summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     assert summary["tracking"]["agents"][0]["rmse_m"] < 0.1
+    (own,) = summary["own_controllers"]
+    assert own["name"] == "own_pid:Pid" and 0 < own["flown_ticks"] <= own["mission_ticks"]
+    assert f"own_pid:Pid flew {own['flown_ticks']} of {own['mission_ticks']} mission ticks" in done.stdout
     events = "".join(path.read_text(encoding="utf-8") for path in directory.glob("*events.jsonl"))
     assert '"TRACK"' in events and "controller_failed" not in events
 

@@ -29,6 +29,8 @@ def test_a_file_is_found_beside_the_configuration_and_recorded_with_it(tmp_path:
     resolved.write_text(dump(config))
     (tmp_path / "a.csv").unlink()
     assert load(resolved) == config, "a run folder needs no other file"
+    for row in ("[0.0, 0.0, 0.0, -1.0]", "[2.0, 1.0, 0.0, -1.0]"):
+        assert f"    {row},\n" in resolved.read_text(), "a row of the file is one line here too"
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def on_cluster(
     try:
         from distributed import Client, as_completed
     except ImportError as error:
-        raise StartError("--dask: needs dask.distributed; pip install 'swarmctl[campaign]'") from error
+        raise StartError("--dask: needs dask.distributed; in the checkout, pip install '.[campaign]'") from error
     url = address if "://" in address else f"tcp://{address}"
     try:
         client = Client(url, timeout="10s")

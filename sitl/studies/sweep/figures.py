@@ -10,6 +10,7 @@ from typing import Any
 import pyarrow as pa
 
 from sitl.studies.sweep.points import Axis
+from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 
 Summary = dict[str, Any]
 Row = dict[str, Any]
@@ -24,6 +25,17 @@ class Figure:
     unit: str
     of: Callable[[Summary], float | None]
     over_seeds: Callable[[Sequence[float]], float] = fmean
+    note: str = ""  # how it is computed, where `text` does not say
+
+    @property
+    def title(self) -> str:
+        """Return what the figure is, with its unit."""
+        return f"{self.text} [{self.unit}]" if self.unit else self.text
+
+    @property
+    def legend(self) -> str:
+        """Return what a column of this name holds."""
+        return f"{self.name}: {self.title}" + (f", {self.note}" if self.note else "")
 
 
 def _agents_mean(name: str) -> Callable[[Summary], float | None]:
@@ -38,6 +50,7 @@ FIGURES = (
     Figure(
         name="index_m",
         text="summed mean tracking error",
+        note=SUMMED_ERROR,
         unit="m",
         of=lambda summary: summary["tracking"]["index_m"],
     ),

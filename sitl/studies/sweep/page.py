@@ -66,10 +66,9 @@ def _chart(figure: Figure, axes: Sequence[Axis], across: int, found: Sequence[Co
         x, y = np.array([[at, math.nan if value is None else value] for at, value in points], np.float64).T
         lines.append(agent_line(number, x, y, label=label, marks=True))
     words = "" if axis.is_number else " (" + ", ".join(f"{k}: {value}" for k, value in enumerate(axis.values)) + ")"
-    unit = f" [{figure.unit}]" if figure.unit else ""
     low, high = min(place.values()), max(place.values())
     shown = (low - _ROOM_01 * (high - low), high + _ROOM_01 * (high - low))
-    return time_chart(f"{figure.text}{unit} over {axis.key}{words}", lines, shown, x_unit="")
+    return time_chart(f"{figure.title} over {axis.key}{words}", lines, shown, x_unit="")
 
 
 def _others(axes: Sequence[Axis], across: int, one: Combination) -> str:

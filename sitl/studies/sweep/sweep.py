@@ -17,16 +17,18 @@ from sitl.studies.campaign.progress import collect
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.store import ROWS, RowStore
 from sitl.studies.campaign.worker_pool import on_this_machine
-from sitl.studies.sweep.figures import SHOWN, Combination, Row, combinations, schema_of
+from sitl.studies.sweep.figures import FIGURES, SHOWN, Combination, Row, combinations, schema_of
 from sitl.studies.sweep.flight import FlySweep
 from sitl.studies.sweep.page import cell_text, write_page
 from sitl.studies.sweep.points import Axis, Flight, flights_of, parse_axes, problems_of
 from swarmctl.config import Config, dump, load
+from swarmctl.core.text import told_apart
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError
 from swarmctl.files import replace_text
 
 BASE = "config.toml"  # in the folder: the configuration to which swept values are applied
 _SHOWN_CHANGES = 5
+_MOST_TEXT = 120  # characters of a value of the configuration
 _Key = tuple[tuple[float | str, ...], int]  # stored values of the axes, and the seed
 
 
@@ -98,7 +100,10 @@ def _claim(directory: Path, base: Config) -> None:
     before, now = (dict(_leaves(config.model_dump(), "")) for config in (load(path), base))
     changed = [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]
     if changed:
-        shown = ", ".join(f"{key} was {before.get(key)} and is {now.get(key)}" for key in changed[:_SHOWN_CHANGES])
+        values = {key: told_apart([str(before.get(key)), str(now.get(key))], _MOST_TEXT) for key in changed}
+        shown = ", ".join(
+            f"{key} was {was} and is {is_now}" for key, (was, is_now) in [*values.items()][:_SHOWN_CHANGES]
+        )
         more = f", and {len(changed) - _SHOWN_CHANGES} more" if len(changed) > _SHOWN_CHANGES else ""
         raise ConfigError(str(path), [f"of another configuration: {shown}{more}. Give a new --out"])
 
@@ -122,3 +127,6 @@ def _print_table(axes: Sequence[Axis], found: Sequence[Combination]) -> None:
         figures = [cell_text(one.figures[name]) for name in SHOWN]
         table.add_row(*map(cell_text, one.values), f"{one.completed}/{one.flights}", *figures)
     Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)
+    for figure in FIGURES:
+        if figure.name in SHOWN:
+            print(f"  {figure.legend}")

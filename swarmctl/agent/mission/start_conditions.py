@@ -37,9 +37,12 @@ class StartConditions:
         )
 
     def report(self, now_us: int) -> None:
-        """Raise the unmet condition as an alert once the agent has waited for a while."""
+        """Raise the unmet condition as an alert once the agent has waited for a while; clear it once it is met."""
         waits_for = self._mission.waits_for
         if self._mission.phase not in (Phase.STANDBY, Phase.READY):
             self._waits_since_us = now_us
-        elif waits_for and now_us - self._waits_since_us > _START_ALERT_DELAY_US:
+            self._alerts.clear("start")
+        elif not waits_for:
+            self._alerts.clear("start")
+        elif now_us - self._waits_since_us > _START_ALERT_DELAY_US:
             self._alerts.put("start", f"waits for {waits_for}", now_us)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from swarmctl.agent.ports import Ports
 from swarmctl.agent.watches.alerts import Alerts
+from swarmctl.core.types import Verb
 from swarmctl.mavlink.commands import CommandResult
+
+_NO_ORIGIN_US = 3_000_000  # it is requested until it is there: that it is refused for a while is nothing to tell
 
 
 class VehicleWatch:
@@ -18,15 +21,28 @@ class VehicleWatch:
     def __init__(self, ports: Ports, alerts: Alerts) -> None:
         self._ports, self._alerts = ports, alerts
         self._gaps = self._jumps = 0  # already reported
+        self._no_origin_us: int | None = None  # since when the vehicle does not tell its origin
 
     def on_result(self, result: CommandResult, now_us: int) -> None:
         """Report how the autopilot has answered a request."""
-        asked = f"{result.command.verb.value} {result.command.name}".rstrip()
-        if result.ok:
+        asked = result.asked
+        if result.command.verb is Verb.MESSAGE:
+            self._report_origin(result, now_us)
+        elif result.ok:
             self._alerts.clear(asked)
         else:
             self._alerts.put(asked, f"{asked} refused: {result.text}", now_us)
         self._ports.note("command", verb=asked, ok=result.ok, text=result.text)
+
+    def _report_origin(self, result: CommandResult, now_us: int) -> None:
+        """Report that the vehicle can't be placed among the others, because it has not told its origin for a while."""
+        if result.ok or self._ports.autopilot.frame.offset_ned_m is not None:
+            self._no_origin_us = None
+            self._alerts.clear("origin")
+            return
+        self._no_origin_us = now_us if self._no_origin_us is None else self._no_origin_us
+        if now_us - self._no_origin_us > _NO_ORIGIN_US:
+            self._alerts.put("origin", f"waits for the vehicle's origin ({result.asked}: {result.text})", now_us)
 
     def report_text(self) -> None:
         """Record what the autopilot tells its operator, one message a tick: a flood must not fill the disk."""

@@ -20,7 +20,7 @@ from swarmctl.control.controllers.kind import Controller, ControllerSetup
 from swarmctl.control.controllers.own import OwnController
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.rollout import ModelledVehicle
-from swarmctl.core.own import in_words
+from swarmctl.core.own import in_words, raised_at, traced
 from swarmctl.core.text import printable
 from swarmctl.core.trajectory import braking_displacement
 from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes, Reference
@@ -30,6 +30,7 @@ LATE_IN_A_ROW = 3  # late plans after which a controller is not asked any more
 BAD_IN_A_ROW = 25  # likewise, without commands: half a second
 _TAIL_POINTS = 30  # of the braking behind a plan
 _MAX_SHOWN = 120  # characters of an exception
+_MOST_TRACED = 8  # places whose traceback is told: a controller may raise in every tick
 
 
 class Guard:
@@ -45,6 +46,8 @@ class Guard:
     def __init__(self, name: str, own: OwnController, fallback: Controller, setup: ControllerSetup) -> None:
         self._name, self._own, self._fallback, self._setup = name, own, fallback, setup
         self._suspended, self._bad, self._late = "", 0, 0
+        self._raised_at: set[str] = set()
+        self._traceback = ""  # of the newest place, until a plan tells it
 
     @property
     def dt_us(self) -> int:
@@ -92,7 +95,15 @@ class Guard:
         try:
             return np.asarray(call(), dtype=np.float64), ""
         except (Exception, SystemExit) as error:  # whatever it raises: the vehicle flies on
-            return np.empty(0), printable(f"raised {in_words(error)}", _MAX_SHOWN)
+            return np.empty(0), self._told(error)
+
+    def _told(self, error: BaseException) -> str:
+        """Return what was raised, and where; the traceback of a new place goes with the next plan."""
+        place = raised_at(error, type(self._own).__module__)
+        if place not in self._raised_at and len(self._raised_at) < _MOST_TRACED:
+            self._raised_at.add(place)
+            self._traceback = traced(error)
+        return f"{printable(f'raised {in_words(error)}', _MAX_SHOWN)} ({printable(place, _MAX_SHOWN)})"
 
     def _malformed(self, commands: Array) -> str:
         if commands.shape != (self.steps, 3):
@@ -109,8 +120,14 @@ class Guard:
             self._suspended = failure
 
     def _instead(self, problem: Problem, why: str) -> Plan:
+        failure, suspended = f"controller {self._name} {why}", bool(self._suspended)
         plan = self._fallback.plan(problem)
-        return replace(plan, failure=f"controller {self._name} {why}", suspended=bool(self._suspended))
+        return replace(plan, failure=failure, suspended=suspended, traceback=self._untold())
+
+    def _untold(self) -> str:
+        """Return the traceback that no plan has told yet, or ""."""
+        untold, self._traceback = self._traceback, ""
+        return untold
 
     def _moved(self, problem: Problem, commands: Array, took_s: float) -> Plan:
         """Return the plan of commands (N, 3): the motion that they give the vehicle by its model."""
@@ -128,6 +145,8 @@ class Guard:
             vel_ned_m_s=vel,
             virtual_control=np.array([vehicle.bounded(command) for command in commands]),
             times=PlanTimes(setup_us=0.0, solve_us=took_s * 1e6, certify_us=0.0),
+            traceback=self._untold(),
+            by_own=True,
         )
 
     def _clearance_m(self, plan: Plan, keep_outs: Sequence[KeepOut]) -> float:

@@ -45,5 +45,8 @@ class AccuracyMonitor:
             return "" if waited_us >= _NO_CLAIM_TIMEOUT_US else "the estimator to tell its accuracy"
         claims_m = [claim for _, claim in self._claims]
         if waited_us < _WINDOW_US or max(claims_m) > min(claims_m) * (1.0 + _SETTLED_CHANGE_01) + _SETTLED_CHANGE_M:
-            return f"the estimator's accuracy to settle (now {claims_m[-1]:.2f} m)"
+            steady = (
+                f"{_SETTLED_CHANGE_01 * 100:.0f} % and {_SETTLED_CHANGE_M * 100:.0f} cm for {_WINDOW_US * 1e-6:.0f} s"
+            )
+            return f"the estimator's accuracy to settle, within {steady} (now {claims_m[-1]:.2f} m)"
         return ""

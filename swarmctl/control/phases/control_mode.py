@@ -17,7 +17,8 @@ class ControlMode(enum.StrEnum):
     HOLD = "HOLD"  # an operator holds it
     GOTO = "GOTO"  # at a point of the operator's, or on the way there
     WAIT = "WAIT"  # it rests because a peer is silent or deadlines are missed
-    RTL = "RTL"  # on its way to its landing place
+    RETURN = "RETURN"  # on its way to its landing place, after a mission that is complete
+    RTL = "RTL"  # the same because an operator, the battery, the link or the loss of a peer has ended the mission
     LANDING = "LANDING"
 
 
@@ -30,6 +31,7 @@ def control_mode(
     paused: bool,
     lands_in_place: bool,
     setpoints_stopped: bool = False,
+    completed: bool = False,
 ) -> str:
     """Return the control mode: the first row that applies."""
     rows = (
@@ -44,6 +46,6 @@ def control_mode(
         (mode is Mode.IDLE, ControlMode.AUTO),
         (paused, ControlMode.WAIT),
         (phase is Phase.GOTO_LAND and lands_in_place, ControlMode.LANDING),
-        (phase is Phase.GOTO_LAND, ControlMode.RTL),
+        (phase is Phase.GOTO_LAND, ControlMode.RETURN if completed else ControlMode.RTL),
     )
     return next((str(name) for applies, name in rows if applies), mode.name)

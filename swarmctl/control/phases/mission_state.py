@@ -28,6 +28,7 @@ from swarmctl.core.types import Array, Command, Landed, Mode, Phase, VehicleStat
 REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
 SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
 PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
+COMPLETED = "completed"  # the outcome of a mission that was flown to its end
 TAKEN_OVER = "pilot or autopilot took over"
 
 
@@ -169,6 +170,7 @@ class MissionState:
             paused=self.interruptions.paused,
             lands_in_place=self.landing.in_place,
             setpoints_stopped=self.setpoints_stopped,
+            completed=self.outcome == COMPLETED,
         )
 
     def is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:

@@ -77,7 +77,7 @@ def report(
         bool, typer.Option("--figures", help="Also write every figure as an SVG file into figures/ of the folder.")
     ] = False,
     png: Annotated[
-        bool, typer.Option("--png", help="The same, and as PNG, too. Needs: pip install 'swarmctl[png]'")
+        bool, typer.Option("--png", help="The same, and as PNG, too. Needs, in the checkout: pip install '.[png]'")
     ] = False,
     output: Annotated[
         Path | None,

@@ -49,7 +49,9 @@ def station(
     config: _ConfigOption,
     run_dir: _RunDir = None,
     sets: _Set = None,
-    view: Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")] = None,
+    view: Annotated[
+        bool | None, typer.Option("--view/--no-view", help="Open the viewer window, or none; recorded either way.")
+    ] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve the view to browsers of this computer.")] = False,
 ) -> int:
     """Show, record, judge and steer a swarm of several hosts. Ctrl-C ends the station; the swarm flies on."""

@@ -83,8 +83,8 @@ def told(verb: str, run: str, give: Callable[[], Sequence[Reply]], *, as_json: b
     else:
         for reply in replies:
             print(reply.line)
-    if problems := [reply.problem for reply in replies if reply.problem]:
-        raise MissionError(f"{verb}: {'; '.join(problems)}")
+    if failed := [f"agent-{reply.agent}" for reply in replies if reply.problem]:  # why has just been printed
+        raise MissionError(f"{verb}: {len(failed)} of {len(replies)} not known to obey: {', '.join(failed)}")
     return EXIT_OK
 
 

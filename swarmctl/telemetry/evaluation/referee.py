@@ -25,6 +25,7 @@ from swarmctl.telemetry.evaluation.run_counts import (
     commitment_counts,
     communication,
     deadlock_counts,
+    own_controllers,
     percentiles,
     solver_counts,
 )
@@ -127,6 +128,7 @@ def evaluate(
         "obstacles": obstacles,
         "volume": volume,
         "timing": timing,
+        "own_controllers": own_controllers(run.events),
         "solver": solver_counts(run.ticks, rules.solver_name),
         "comms": communication(run.ticks, run.events, tracks.time_field),
         "deadlocks": deadlock_counts(run.events),

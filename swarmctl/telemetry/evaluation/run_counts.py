@@ -98,6 +98,15 @@ def commitment_counts(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | N
     }
 
 
+def own_controllers(events: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Sum over agents, for each own controller, the ticks of missions, and those of them that it has flown."""
+    ticks: dict[str, Counter[str]] = {}
+    for event in _last_of_each_source(events, "controller_summary"):
+        counts = {key: int(finite(event.get(key)) or 0) for key in ("flown_ticks", "mission_ticks")}
+        ticks.setdefault(str(event.get("controller")), Counter()).update(counts)
+    return [{"name": name, **counts} for name, counts in sorted(ticks.items())]
+
+
 def percentiles(parts: Sequence[Array]) -> dict[str, float | None]:
     """Return median, 99th percentile and maximum of the finite values."""
     values = np.concatenate([np.asarray(part, np.float64) for part in parts]) if parts else np.zeros(0)

@@ -71,7 +71,9 @@ def write_mcap(path: Path, recorded: RecordedFlight) -> None:
     try:
         import foxglove
     except ImportError as error:
-        raise StartError("MCAP needs a library of its own. Install it with: pip install 'swarmctl[mcap]'") from error
+        raise StartError(
+            "MCAP needs a library of its own. Install it, in the checkout: pip install '.[mcap]'"
+        ) from error
     context = foxglove.Context()
     with replaced(path) as file, foxglove.open_mcap(file, context=context) as writer:
         writer.write_metadata("swarmctl", {"version": __version__})

@@ -81,6 +81,12 @@ class _Goals(msgspec.Struct):
     agents: list[_AtGoal]
 
 
+class _OwnController(msgspec.Struct):
+    name: str
+    flown_ticks: _Count
+    mission_ticks: _Count
+
+
 class _Summary(msgspec.Struct):
     outcome: Outcome
     violations: list[str]
@@ -96,6 +102,7 @@ class _Summary(msgspec.Struct):
     version: str = ""  # missing in older folders, as are the next
     deadlocks: _Deadlocks = msgspec.field(default_factory=_Deadlocks)
     goals: _Goals | None = None
+    own_controllers: list[_OwnController] = []
 
 
 def decode_summary(content: bytes) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from swarmctl.core.text import told_apart
 from swarmctl.core.tick_record import CURVES, Curve
 from swarmctl.core.types import Array
 from swarmctl.files import replace_text
@@ -16,7 +17,7 @@ from swarmctl.telemetry.evaluation.referee import Rules, RunData
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.report.charts import Limit, Line, time_chart
 from swarmctl.telemetry.report.pages import render
-from swarmctl.telemetry.report.run_charts import RunCharts
+from swarmctl.telemetry.report.run_charts import IN_FLIGHT, RunCharts
 from swarmctl.telemetry.report.run_report import summary_rows
 from swarmctl.telemetry.report.svg import Figure
 
@@ -75,7 +76,7 @@ def differences(texts: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
     for key in sorted({key for tree in trees for key in tree}):
         values = [tree.get(key, "") for tree in trees]
         if len(set(values)) > 1:
-            yield key, [value if len(value) <= _MOST_TEXT else f"{value[:_MOST_TEXT]} ..." for value in values]
+            yield key, told_apart(values, _MOST_TEXT)
 
 
 def _flat(prefix: str, tree: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -96,7 +97,7 @@ def _charts(runs: Sequence[JudgedRun], charts: Sequence[RunCharts]) -> Iterator[
     for name, curve in CURVES.items():
         worst = [_worst(chart, name, curve) for chart in charts]
         if any(len(line["x"]) for line in worst):
-            yield _chart(f"{curve.title}, {curve.worst} of all agents", runs, worst)
+            yield _chart(f"{curve.titled(IN_FLIGHT)}, {curve.worst} of all agents", runs, worst)
 
 
 def _chart(title: str, runs: Sequence[JudgedRun], lines: Sequence[Mapping[str, Array]], limits: Any = ()) -> Figure:

@@ -16,5 +16,5 @@ def png_of(document: str) -> bytes:
     try:
         from resvg_py import svg_to_bytes
     except ImportError as error:
-        raise StartError("PNG needs a library of its own. Install it with: pip install 'swarmctl[png]'") from error
+        raise StartError("PNG needs a library of its own. Install it, in the checkout: pip install '.[png]'") from error
     return svg_to_bytes(svg_string=document, zoom=_ZOOM)

@@ -45,6 +45,7 @@ from swarmctl.telemetry.report.svg import Figure
 
 DETAILED_AGENTS = 6  # number of agents with attitude charts
 _ALL_POINTS = 42_000  # points of all lines together, 13 bytes each: keeps the page below 1 MB
+IN_FLIGHT = "from arming on"  # what is counted in a flight: its verdict leaves out what was before
 _ALL_REFERENCES = reference_line(np.zeros(0), np.zeros(0))  # for the legend: each is in the colour of its agent
 
 
@@ -183,11 +184,15 @@ class RunCharts:
         return {"x": (self._tracks.t_us - self._start_us) / 1e6, "y": closest_pair_m(self._tracks.pos_ned_m)}
 
     def curve_of_agents(self, name: str, curve: Curve) -> Iterator[tuple[Array, Array]]:
-        """Yield mission times (T,) and values (T,) of one recorded column, agent by agent, while they fly."""
+        """Yield mission times (T,) and values (T,) of one recorded column, agent by agent, while they fly.
+
+        Counts begin at 0, where the verdict's do.
+        """
         for agent in self._agents:
             rows = flight_rows(self._run.ticks[agent])
             rows = rows if curve.where is None else rows[curve.where(rows)]
-            yield self._seconds(rows), np.asarray(rows[name], np.float64)
+            values = np.asarray(rows[name], np.float64)
+            yield self._seconds(rows), values - values[:1] if curve.is_count else values
 
     def _curve(self, name: str, curve: Curve) -> Figure | None:
         """Return the chart of a column; None where nothing is known of it."""
@@ -198,7 +203,9 @@ class RunCharts:
         lines = [
             agent_line(agent, x, y, width=1.0, opacity=0.8) for agent, (x, y) in zip(self._agents, drawn, strict=True)
         ]
-        return self._chart(curve.title, lines, from_zero=True, ceiling=None if curve.is_count else 1.5 * max(peaks))
+        return self._chart(
+            curve.titled(IN_FLIGHT), lines, from_zero=True, ceiling=None if curve.is_count else 1.5 * max(peaks)
+        )
 
     def _spans(self, name: str, kind: Any, colors: Mapping[str, tuple[int, int, int]]) -> list[tuple[str, list[Span]]]:
         result = []

@@ -13,7 +13,7 @@ from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR, Rules, RunData
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.report.pages import render
 from swarmctl.telemetry.report.png import png_of
-from swarmctl.telemetry.report.run_charts import RunCharts
+from swarmctl.telemetry.report.run_charts import IN_FLIGHT, RunCharts
 from swarmctl.telemetry.report.svg import Figure
 
 REPORT = "report.html"
@@ -113,7 +113,7 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     good = None if share is None or most is None else share <= most
     late = f"{timing['late_ticks']} of {due}"
     limit = "" if most is None else f"{most:.0%}"
-    yield SummaryRow("deadline misses", late, limit, good, timing["late_ticks"])
+    yield SummaryRow(f"deadline misses {IN_FLIGHT}", late, limit, good, timing["late_ticks"])
     named = ("summed mean tracking error", "index_m", SUMMED_ERROR), ("the same after 10 s", "index_after_10s_m", "")
     for name, key, note in named:
         error_m = summary["tracking"][key]
@@ -121,6 +121,9 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     for name, key in (("tick time", "tick_ms"), ("solve time", "solve_ms")):
         values = " / ".join(_figure(timing[key][part], "", 2) for part in ("p50", "p99", "max"))
         yield SummaryRow(f"{name}, median / p99 / max", f"{values} ms", number=timing[key]["p50"])
+    for own in summary.get("own_controllers") or ():
+        flown = f"{own['flown_ticks']} of {own['mission_ticks']}"
+        yield SummaryRow(f"mission ticks flown by {own['name']}", flown, number=own["flown_ticks"])
     solver, comms = summary["solver"], summary["comms"]
     yield SummaryRow(f"solver ({solver['name']}) failures", str(solver["failed"]))
     yield SummaryRow("plans refused by their certificate", str(solver["not_certified"]))

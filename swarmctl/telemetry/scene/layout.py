@@ -68,7 +68,7 @@ def _plots(name: str, page: str, agents: int) -> Any:
     plots = error + [(key, curve) for key, curve in CURVES.items() if curve.page == page]
     crowded = agents > _LEGENDS
     views = [
-        _plot(f"/plot/{key}", curve.title, legend=not crowded or k == 0, is_share=curve.is_share)
+        _plot(f"/plot/{key}", curve.titled("since the start"), legend=not crowded or k == 0, is_share=curve.is_share)
         for k, (key, curve) in enumerate(plots)
     ]
     shares = [3.0 if crowded and k == 0 else 1.0 for k in range(len(views))]

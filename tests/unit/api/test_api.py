@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ import swarmctl
 from swarmctl.api.flight_process import FlightProcess
 from swarmctl.config import Config
 from swarmctl.core.types import Phase
+from swarmctl.ops.operator import LAUNCH_FILE, RunningLaunch
 from tests.unit.ops.test_cli import HEAVY
 from tests.unit.telemetry.test_hostile_run_folder import REFUSED
 from tests.unit.telemetry.test_run_folder import write_finished_run
@@ -152,6 +154,12 @@ def test_waiting_has_an_end(tmp_path: Path) -> None:
     swarm = swarmctl.Swarm(Config(), tmp_path, process)
     with pytest.raises(swarmctl.StartError, match="still flies"):
         _ = swarm.run
+    ending = RunningLaunch("circle-1a", "unixsock-stream//x", 1, 0.0, 3, str(tmp_path), ending=True)
+    (tmp_path / LAUNCH_FILE).write_bytes(msgspec.json.encode(ending))
+    with pytest.raises(swarmctl.StartError, match="is ending"):
+        swarm.status()
+    with pytest.raises(swarmctl.StartError, match="is ending"):
+        swarm.hold()
     with swarm:
         pass
     assert not swarm.is_flying, "the end of the block has asked it to land, and waited"

@@ -260,6 +260,7 @@ def test_a_summary_is_five_lines_even_when_almost_empty() -> None:
         lines = summary_lines(summary, Path("runs/x"))
         assert len(lines) == 5
         assert lines[-1] == "run folder runs/x"
+        assert "0 bus messages refused" in lines[3], "an autopilot may refuse requests all the same"
     assert "2 violations" in lines[0]
 
 

@@ -258,6 +258,16 @@ def test_a_stop_of_what_has_landed_is_done_already_but_not_of_what_was_handed_ba
         assert "in the air" in flight.ask(verb)
 
 
+def test_only_who_was_sent_home_is_shown_as_such() -> None:
+    """On its way to its landing place after the mission it returns; nobody has said `rtl`."""
+    flights = {"": in_phase(Phase.GOTO_LAND), "rtl": controlled(Phase.TRACK)}
+    for verb, flight in flights.items():
+        assert not verb or flight.ask(verb) == ""
+        flight.until(Phase.GOTO_LAND)
+    shown = {verb: flight.mission.control_mode(Mode.TRACKING) for verb, flight in flights.items()}
+    assert shown == {"": "RETURN", "rtl": "RTL"}
+
+
 def test_the_time_of_a_hold_does_not_count_as_time_to_the_start() -> None:
     flight = Flight(start_timeout_s=20.0)
     flight.until(Phase.TAKEOFF)

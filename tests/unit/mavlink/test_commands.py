@@ -127,19 +127,35 @@ def test_an_acknowledgement_ends_the_asking() -> None:
     bench = Bench()
     bench.port.request(Command(verb=Verb.ARM))
     bench.run(0.1)
-    assert bench.hear(ack(400)) == [CommandResult(Command(verb=Verb.ARM), True, "result 0")]
+    assert bench.hear(ack(400)) == [CommandResult(Command(verb=Verb.ARM), True, "accepted")]
     assert bench.run(3.0) == []
     assert not bench.port.busy
 
 
-@pytest.mark.parametrize("result", [1, 2, 3, 4])
-def test_a_refusal_is_a_result_with_its_code_and_is_not_asked_again(result: int) -> None:
+@pytest.mark.parametrize(
+    ("result", "words"),
+    [(1, "temporarily rejected"), (2, "denied"), (3, "unsupported"), (4, "failed"), (77, "result 77")],
+)
+def test_a_refusal_is_a_result_in_words_and_is_not_asked_again(result: int, words: str) -> None:
     bench = Bench()
     bench.port.request(Command(verb=Verb.ARM))
     bench.run(0.1)
     (answer,) = bench.hear(ack(400, result))
-    assert (answer.ok, answer.text) == (False, f"result {result}")
+    assert (answer.ok, answer.text) == (False, words)
     assert bench.run(3.0) == []
+
+
+@pytest.mark.parametrize(
+    ("command", "asked"),
+    [
+        (Command(verb=Verb.MESSAGE, number=49), "message GPS_GLOBAL_ORIGIN"),
+        (Command(verb=Verb.RATE, number=331, value=50.0), "rate ODOMETRY"),
+        (Command(verb=Verb.PARAM_INT, number=49, name="NAV_DLL_ACT"), "param_int NAV_DLL_ACT"),
+        (Command(verb=Verb.ARM), "arm"),
+    ],
+)
+def test_a_result_names_what_was_requested(command: Command, asked: str) -> None:
+    assert CommandResult(command, True, "accepted").asked == asked
 
 
 def test_in_progress_is_not_an_answer_yet() -> None:

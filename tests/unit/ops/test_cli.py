@@ -163,13 +163,14 @@ def test_a_verb_of_the_operator_has_an_option_for_each_argument(
     assert "Height [m]." in capsys.readouterr().out
 
 
-def test_answers_as_json_name_everybody_and_the_exit_code_stays(capsys: pytest.CaptureFixture[str]) -> None:
+def test_answers_name_everybody_and_why_once_and_the_exit_code_stays(capsys: pytest.CaptureFixture[str]) -> None:
     replies = [
         Reply(agent=0, verb="hold", answer=Answer("hold", 5, accepted=True), phase=Phase.TRACK),
         Reply(agent=1, verb="hold", answer=Answer("hold", 5, accepted=False, reason="it is in LAND"), phase=Phase.LAND),
         Reply(agent=2, verb="hold", answer=None),
     ]
-    with pytest.raises(MissionError, match="agent-1 refuses: it is in LAND; agent-2 did not answer"):
+    failed = "hold: 2 of 3 not known to obey: agent-1, agent-2"
+    with pytest.raises(MissionError, match=f"^{failed}$"):
         orders.told("hold", "circle-1a", lambda: replies, as_json=True)
     printed = json.loads(capsys.readouterr().out)
     assert [agent.pop("comes_to") for agent in printed["agents"]] == ["", "", ""]
@@ -184,6 +185,9 @@ def test_answers_as_json_name_everybody_and_the_exit_code_stays(capsys: pytest.C
     }
     assert orders.told("hold", "circle-1a", lambda: replies[:1]) == 0
     assert capsys.readouterr().out == "hold: circle-1a\nagent-0 accepts, TRACK\n"
+    with pytest.raises(MissionError, match=f"^{failed}$"):
+        orders.told("hold", "circle-1a", lambda: replies)
+    assert capsys.readouterr().out.count("agent-1 refuses: it is in LAND\n") == 1, "why is said once"
 
 
 def test_what_an_accepted_order_comes_to_is_printed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -122,6 +122,9 @@ def test_an_agent_that_is_silent_is_lost_and_its_link_ages() -> None:
         (Phase.TAKEOFF, Mode.IDLE, "", "AUTO"),
         (Phase.TAKEOFF, Mode.IDLE, "held", "HOLD"),
         (Phase.GOTO_LAND, Mode.TRACKING, "", "RTL"),
+        (Phase.GOTO_LAND, Mode.TRACKING, "completed", "RETURN"),
+        (Phase.GOTO_LAND, Mode.TRACKING, "completed held", "HOLD"),
+        (Phase.GOTO_LAND, Mode.TRACKING, "completed lands_in_place", "LANDING"),
         (Phase.GOTO_LAND, Mode.TRACKING, "held lands_in_place", "HOLD"),
         (Phase.GOTO_LAND, Mode.TRACKING, "lands_in_place", "LANDING"),
         (Phase.LAND, Mode.IDLE, "lands_in_place", "LANDING"),
@@ -129,7 +132,7 @@ def test_an_agent_that_is_silent_is_lost_and_its_link_ages() -> None:
     ],
 )
 def test_the_control_mode_is_what_the_vehicle_does(phase: Phase, mode: Mode, flags: str, shown: str) -> None:
-    names = ("held", "goes_to_point", "paused", "lands_in_place", "setpoints_stopped")
+    names = ("held", "goes_to_point", "paused", "lands_in_place", "setpoints_stopped", "completed")
     asked = {name: name in flags.split() for name in names}
     assert control_mode(phase, mode, **asked) == shown
 

@@ -46,13 +46,14 @@ class Scene:
 
 
 def test_the_address_is_published_and_the_page_is_shown_where_it_was_asked_for() -> None:
-    plain, web = Scene(), Scene("--web")
-    for scene in (plain, web):
+    plain, window, web = Scene(), Scene("--view"), Scene("--web")
+    for scene in (plain, window, web):
         assert scene.step() == []
         scene.viewer.said = [f"viewer {LIVE}", f"page {PAGE}"]
-    assert plain.step() == [f"view {LIVE}"]
+    assert plain.step() == [f"view {LIVE} (no window; open one with: swarmctl view)"]
+    assert window.step() == [f"view {LIVE}"]
     assert web.step() == [f"view {LIVE}", f"open in a browser: {PAGE}"]
-    assert plain.published == web.published == [LIVE]
+    assert plain.published == window.published == web.published == [LIVE]
 
 
 def test_a_viewer_that_freezes_before_it_serves_a_page_or_ends_is_told_once() -> None:

@@ -156,9 +156,12 @@ def test_the_table_has_units_and_the_page_every_combination(
     assert run(tmp_path, RADIUS, KIND, "--set=swarm.agents=3", "--seeds=3") == 4, "a flight has failed"
     table = capsys.readouterr().out
     assert "radius_m" in table and table.count("2/3") == 4
+    index = "index_m: summed mean tracking error [m], distances of all agents to their reference, added up"
+    assert index in table and "violations: violations found" in table
     schema = pq.read_schema(tmp_path / "rows.parquet")
     assert schema.field("index_m").metadata[b"unit"] == b"m"
     page = (tmp_path / "report.html").read_text()
+    assert f"<li>{index}" in page
     assert page.count("<figure>") == len(FIGURES) - 1, "nothing is drawn of what nobody measured"
     assert "mission.kind = hover" in page and "mission.kind = circle" in page, "a line for each value of the other key"
     assert page.count("<tr><td>") == 4

@@ -167,7 +167,7 @@ def test_another_program_opens_it_and_finds_all_in_order(path: Path) -> None:
 
 def test_without_the_library_it_is_said_how_to_install_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(StartError, match=r"pip install 'swarmctl\[mcap\]'"):
+    with pytest.raises(StartError, match=r"pip install '\.\[mcap\]'"):
         export_mcap(folder, None)
 
 

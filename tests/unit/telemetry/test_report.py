@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from swarmctl.config import Config, dump, load_recorded
+from swarmctl.core.tick_record import CURVES
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.verbs.folders import report
@@ -23,6 +24,7 @@ from swarmctl.telemetry.recording.run_files import load_run
 from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
 from swarmctl.telemetry.report import svg
 from swarmctl.telemetry.report.comparison import differences
+from swarmctl.telemetry.report.run_charts import RunCharts
 from tests.unit.telemetry.test_run_folder import flight, write_run
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -109,6 +111,22 @@ def test_goals_are_those_of_the_mission_that_an_operator_has_set_last(tmp_path: 
     assert re.findall(r">(goal[^<]*)</text>", above) == ["goal 0, 1", "goal 2"]
 
 
+def test_table_and_chart_count_the_same_deadline_misses(tmp_path: Path) -> None:
+    directory = finish(tmp_path / "late")
+    ticks = load_run(directory).ticks
+    for agent, rows in ticks.items():
+        begun = np.clip(np.arange(len(rows)) // 10, 0, 3) + np.where(rows["phase"] >= Phase.TRACK, agent, 0)
+        rows["deadline_misses"] = begun  # three before arming, and in flight as many as the agent's number
+        rows.tofile(directory / f"agent-{agent}.ticks")
+    finish_run(directory, Config().rules(), Outcome(outcome="completed"))
+    page = (directory / "report.html").read_text()
+    chart = RunCharts(load_run(directory), {"agents": 3}, None)
+    counted = [values for _, values in chart.curve_of_agents("deadline_misses", CURVES["deadline_misses"])]
+    assert [(values[0], values[-1]) for values in counted] == [(0, 0), (0, 1), (0, 2)]
+    assert "Deadline misses from arming on" in figures(page)
+    assert re.search(r"<td>deadline misses from arming on</td>\s*<td[^>]*>3 of \d+<", page)
+
+
 def test_every_colour_of_a_page_is_known_by_day_and_in_the_dark(folder: Path) -> None:
     page = (folder / "report.html").read_text()
     light, dark = page.split("@media (prefers-color-scheme: dark)", 1)
@@ -161,7 +179,7 @@ def test_figures_are_drawn_as_png_where_it_is_asked_for(
     for color in (agent_rgb(0), agent_rgb(1), (255, 255, 255)):
         assert (image == color).all(axis=2).sum() > 100, color
     monkeypatch.setitem(sys.modules, "resvg_py", None)
-    with pytest.raises(StartError, match=r"pip install 'swarmctl\[png\]'"):
+    with pytest.raises(StartError, match=r"pip install '\.\[png\]'"):
         report([copied], png=True)
 
 
@@ -193,6 +211,18 @@ def test_runs_are_set_beside_each_other(folder: Path, shared: Path, capsys: pyte
 def test_only_what_differs_in_the_configuration_is_listed() -> None:
     texts = ["a = 1\n[b]\nc = [1, 2]\nd = 'x'\n", "a = 1\n[b]\nc = [1, 3]\nd = 'x'\ne = true\n"]
     assert list(differences(texts)) == [("b.c", ["[1, 2]", "[1, 3]"]), ("b.e", ["", "True"])]
+
+
+def test_of_long_values_that_part_is_listed_in_which_they_differ() -> None:
+    rows = [f"rows = {[[float(t), 0.0] for t in range(1000)] + [[float(end), 1.0]]}\n" for end in (1, 2)]
+    ((key, (first, second)),) = differences(rows)
+    assert key == "rows"
+    assert "[1.0, 1.0]" in first and "[2.0, 1.0]" in second
+    assert first.startswith("... ") and max(len(first), len(second)) < 130
+    ((_, (many, none, absent)),) = differences([rows[0], "rows = []\n", ""])
+    assert many.startswith("[[0.0, 0.0], [1.0") and many.endswith(" ...") and (none, absent) == ("[]", "")
+    ((_, (alone, _)),) = differences([rows[0], ""])
+    assert alone.startswith("[[0.0, 0.0], [1.0")
 
 
 def test_what_can_not_be_compared_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ class QpParams(Params):
         if not SOLVERS[solver]():
             raise PydanticCustomError(
                 "missing_package",
-                "{solver} is not installed; pip install 'swarmctl[{solver}]', or use solver = 'osqp'",
+                "{solver} is not installed; in the checkout, pip install '.[{solver}]', or use solver = 'osqp'",
                 {"solver": solver},
             )
         return solver

@@ -5,7 +5,7 @@ from __future__ import annotations
 from swarmctl.control.phases import handover
 from swarmctl.control.phases.departure import names_of
 from swarmctl.control.phases.inputs import PhaseInputs
-from swarmctl.control.phases.mission_state import MissionState
+from swarmctl.control.phases.mission_state import COMPLETED, MissionState
 from swarmctl.core.types import Command, Phase, VehicleState
 
 BEGIN_DELAY_US = 1_000_000  # from the last agent's readiness to mission time 0; several statuses are sent meanwhile
@@ -34,7 +34,7 @@ def track(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> li
         mission.give_up(excess, inputs, state)
         return []
     if inputs.utc_us - mission.begin_utc_us >= mission.duration_us and not mission.interruptions.active:
-        mission.outcome = mission.outcome or "completed"
+        mission.outcome = mission.outcome or COMPLETED
         if mission.airborne and not inputs.peers():
             mission.enter(Phase.LAND, inputs.now_us)
         elif mission.airborne:
