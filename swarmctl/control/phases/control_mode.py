@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-import enum
+from swarmctl.core.types import ControlMode, Mode, Phase
 
-from swarmctl.core.types import Mode, Phase
-
-
-class ControlMode(enum.StrEnum):
-    """Names what a vehicle is doing; where the failsafe decides, its modes have their own names."""
-
-    LOST = "LOST"  # no vehicle state that is new enough
-    PILOT = "PILOT"  # its pilot or its autopilot has taken over
-    FAILSAFE = "FAILSAFE"  # its autopilot has, because our setpoints had stopped
-    AUTO = "AUTO"  # its autopilot flies it at the agent's request, or it stands
-    HOLD = "HOLD"  # an operator holds it
-    GOTO = "GOTO"  # at a point of the operator's, or on the way there
-    WAIT = "WAIT"  # it rests because a peer is silent or deadlines are missed
-    RTL = "RTL"  # on its way to its landing place
-    LANDING = "LANDING"
+_FAILSAFES = {
+    Mode.REPLAY: ControlMode.REPLAY,
+    Mode.BRAKE: ControlMode.BRAKE,
+    Mode.HOLD: ControlMode.HOLD,
+}
 
 
 def control_mode(
@@ -30,7 +20,7 @@ def control_mode(
     paused: bool,
     lands_in_place: bool,
     setpoints_stopped: bool = False,
-) -> str:
+) -> ControlMode:
     """Return the control mode: the first row that applies."""
     rows = (
         (phase is Phase.CONNECT, ControlMode.AUTO),  # it was not seen yet
@@ -38,12 +28,13 @@ def control_mode(
         (mode is Mode.PILOT_OVERRIDE and setpoints_stopped, ControlMode.FAILSAFE),
         (mode is Mode.PILOT_OVERRIDE, ControlMode.PILOT),
         (phase is Phase.LAND or mode is Mode.LAND, ControlMode.LANDING),
-        (mode in (Mode.REPLAY, Mode.BRAKE, Mode.HOLD), mode.name),
+        *((mode is decided, shown) for decided, shown in _FAILSAFES.items()),
         (goes_to_point, ControlMode.GOTO),
         (held, ControlMode.HOLD),
         (mode is Mode.IDLE, ControlMode.AUTO),
         (paused, ControlMode.WAIT),
         (phase is Phase.GOTO_LAND and lands_in_place, ControlMode.LANDING),
         (phase is Phase.GOTO_LAND, ControlMode.RTL),
+        (mode is Mode.PRIMING, ControlMode.PRIMING),
     )
-    return next((str(name) for applies, name in rows if applies), mode.name)
+    return next((shown for applies, shown in rows if applies), ControlMode.TRACKING)
