@@ -37,12 +37,14 @@ def write_report(
     """
     charts, path = RunCharts(run, summary, rules), directory / REPORT
     events = list(event_rows(run.events, charts.time_of))
+    missions, tracked_s = charts.flown_missions()
     page = render(
         __package__,
         "report.html",
         name=directory.resolve().name,
         summary=summary,
-        flown=_flown(summary, charts),
+        flown=_flown(summary, missions, tracked_s),
+        several_missions=missions > 1,
         has_moments=bool(charts.moments),
         rows=summary_rows(summary, rules),
         seen_from_above=charts.seen_from_above(),
@@ -95,15 +97,12 @@ class SummaryRow(NamedTuple):
     note: str = ""  # what it is
 
 
-def _flown(summary: Mapping[str, Any], charts: RunCharts) -> str:
+def _flown(summary: Mapping[str, Any], missions: int, tracked_s: float) -> str:
     """Return for how long the mission was flown; of several, the newest and all together."""
-    count, tracked_s = charts.flown_missions()
     duration = _figure(summary["duration_s"], "s", 1)
-    return (
-        f"{duration} of mission time"
-        if count < 2
-        else f"{duration} of the {ordinal(count)} mission, {tracked_s:.1f} s in TRACK"
-    )
+    if missions < 2:
+        return f"{duration} of mission time"
+    return f"{duration} of the {ordinal(missions)} mission, {tracked_s:.1f} s in TRACK"
 
 
 def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[SummaryRow]:

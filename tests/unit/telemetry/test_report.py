@@ -127,7 +127,7 @@ def legend(figure: str) -> list[str]:
 
 def test_orders_and_further_missions_are_marked_and_told_apart(tmp_path: Path) -> None:
     page = (operators_flight(tmp_path / "operated") / "report.html").read_text()
-    assert ", 5.0 s of the second mission, 12.0 s in TRACK." in page
+    assert ", 5.0 s of the second mission, 12.0 s in TRACK. Times count from the start of the first mission;" in page
     drawn = figures(page)
     did = drawn["What the agent did"]
     assert legend(did) == [
@@ -150,7 +150,7 @@ def test_orders_and_further_missions_are_marked_and_told_apart(tmp_path: Path) -
 
 def test_a_run_without_orders_has_one_mission_and_no_marks(shared: Path) -> None:
     page = (shared / "report.html").read_text()
-    assert ", 3.0 s of mission time. Times" in page
+    assert ", 3.0 s of mission time. Times count from mission start;" in page
     assert "upright" not in page.split("</style>")[1]
 
 
