@@ -19,6 +19,7 @@ from swarmctl.core.stored_column import StoredColumn
 from swarmctl.core.types import (
     Array,
     AttitudeSetpoint,
+    ControlMode,
     FlightMode,
     Mode,
     Phase,
@@ -59,6 +60,7 @@ class TickRecord:
     mission_t_s: float  # NaN outside TRACK
     phase: Phase
     mode: Mode
+    control: ControlMode
     flight_mode: FlightMode
     armed: bool
     state: VehicleState | None
@@ -133,6 +135,7 @@ _MISSES = Curve(title="Deadline misses", is_count=True, is_slow=True)
 _STALENESS = Curve(title="Plan staleness, oldest of the peers' [ms]", page="swarm")
 _BATTERY = Curve(title="Battery [0..1]", page="swarm", worst="smallest", is_slow=True, is_share=True)
 _TYPES = "in `swarmctl/core/types.py`"
+NOT_RECORDED = 255  # in place of an enumeration's number, of a recording that lacks the column
 
 COLUMNS = (
     Column(name="t_us", dtype=_I8, unit="us", text="monotonic time of the tick", value=lambda tick: tick.t_us),
@@ -338,6 +341,14 @@ COLUMNS = (
         text="charge of the battery that remains, as the autopilot reports it; NaN while unknown",
         value=lambda tick: tick.battery_01,
         view=_BATTERY,
+    ),
+    Column(
+        name="control",
+        dtype=_U1,
+        text=f"what the vehicle is doing, in the words of `status`, `ControlMode` {_TYPES}; 255: not recorded",
+        names=ControlMode,
+        value=lambda tick: tick.control,
+        absent=NOT_RECORDED,
     ),
 )
 CURVES = {column.name: column.view for column in COLUMNS if isinstance(column.view, Curve)}

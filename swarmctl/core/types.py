@@ -71,6 +71,28 @@ class Mode(enum.IntEnum):
     STATE_STALE = 8  # own state too old: nothing is sent, the autopilot's failsafe acts
 
 
+class ControlMode(enum.IntEnum):
+    """What an operator is shown that a vehicle is doing, as `control.phases.control_mode` decides it.
+
+    Where the failsafe decides, its modes have their own names.
+    """
+
+    AUTO = 0  # its autopilot flies it at the agent's request, or it stands
+    PRIMING = 1
+    TRACKING = 2
+    REPLAY = 3
+    BRAKE = 4
+    HOLD = 5  # an operator holds it, or the failsafe does
+    GOTO = 6  # at a point of the operator's, or on the way there
+    WAIT = 7  # it rests because a peer is silent or deadlines are missed
+    RETURN = 8  # on its way to its landing place, after a mission that is complete
+    RTL = 9  # the same because an operator, the battery, the link or the loss of a peer has ended the mission
+    LANDING = 10
+    PILOT = 11  # its pilot or its autopilot has taken over
+    FAILSAFE = 12  # its autopilot has, because our setpoints had stopped
+    LOST = 13  # no vehicle state that is new enough
+
+
 class Verb(enum.Enum):
     """The kinds of requests to an autopilot."""
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Iterator
+import os
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from swarmctl.built_in_configs import built_in_config
+from swarmctl.built_in_configs import EXAMPLES, built_in_files
 from swarmctl.config import Config
 from swarmctl.config_keys import Key, Section, meanings, model_in, sections, value_text
 from swarmctl.core.params import Params
@@ -152,15 +154,23 @@ def _references(node: Any) -> Iterator[str]:
             yield from _references(inner)
 
 
-def initial_text(name: str) -> str:
-    """Return a commented file to begin with: a built-in configuration, or every key with its default.
+def initial_files(name: str, output: Path | None = None) -> dict[Path, str]:
+    """Return commented files to begin with: a built-in configuration, an example, or every key with its default.
+
+    Args:
+        name: of the configuration, as its file without the ending.
+        output: path of its first file, beside which the others belong; None: its own name, in the folder one is in.
 
     Raises:
         ConfigError: there is none of that name.
     """
     if name == DEFAULTS:
-        return _HEAD + "".join(map(_commented, sections()))
-    return built_in_config(name).read_text(encoding="utf-8")
+        return {output or Path(f"{DEFAULTS}.toml"): _HEAD + "".join(map(_commented, sections()))}
+    first, *others = built_in_files(name)
+    path = output or Path(first.name)
+    texts = {path: first, **{path.with_name(other.name): other for other in others}}
+    here = re.compile(rf"\bconfigs/(?:{EXAMPLES}/)?(?={re.escape(name)}\.)")  # commands in comments are of the copies
+    return {to: here.sub("", file.read_text(encoding="utf-8")) for to, file in texts.items()}
 
 
 def _commented(section: Section) -> str:
@@ -175,17 +185,19 @@ def _commented_key(key: Key) -> str:
     return f"#{key.name} = {value}  # {about}\n".replace("`", "")
 
 
-def write_new(path: Path, text: str) -> None:
-    """Write a file that does not exist yet.
+def write_new(texts: Mapping[Path, str]) -> None:
+    """Write files that do not exist yet: all or none.
 
     Raises:
         ConfigError: there is one.
-        StartError: it can't be written.
+        StartError: one can't be written.
     """
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError as error:
-        raise ConfigError(str(path), ["exists already; give another name"]) from error
-    except OSError as error:
-        raise StartError(f"{path}: can't be written: {error.strerror}") from error
+    for path in texts:
+        if os.path.lexists(path):
+            raise ConfigError(str(path), ["exists already; give another name, or go to another folder"])
+    for path, text in texts.items():
+        try:
+            with path.open("x", encoding="utf-8") as file:
+                file.write(text)
+        except OSError as error:
+            raise StartError(f"{path}: can't be written: {error.strerror}") from error

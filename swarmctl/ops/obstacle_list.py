@@ -163,7 +163,7 @@ def write_file(path: Path, known: ObstaclesMessage) -> None:
     """
     listed = [_shown(item, known.utc_us) for item in known.obstacles]
     tables = [{key: value for key, value in item.items() if key != "number"} for item in listed]
-    write_new(path, tomli_w.dumps({"obstacles": tables}))
+    write_new({path: tomli_w.dumps({"obstacles": tables})})
 
 
 def as_json(known: ObstaclesMessage) -> str:

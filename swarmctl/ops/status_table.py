@@ -22,9 +22,8 @@ from rich.text import Text
 
 from swarmctl.bus.json_messages import StatusMessage
 from swarmctl.bus.peers import agent_name
-from swarmctl.control.phases.control_mode import ControlMode
 from swarmctl.core.text import printable
-from swarmctl.core.types import FlightMode, Phase
+from swarmctl.core.types import ControlMode, FlightMode, Phase
 from swarmctl.telemetry.recording.event_log import EventLog
 
 REFRESH_HZ = 4.0
@@ -56,7 +55,7 @@ class AgentView:
         if self.status is None:
             return ""
         lost = self.silent_s > _SILENT_S and self.status.phase != Phase.DONE  # what is done may end
-        return ControlMode.LOST if lost else printable(self.status.control, 8)
+        return ControlMode.LOST.name if lost else printable(self.status.control, 8)
 
     @property
     def alert(self) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import (
     AttitudeSetpoint,
+    ControlMode,
     FlightMode,
     Mode,
     Phase,
@@ -57,6 +58,7 @@ def tick_record(**changes: Any) -> TickRecord:
         "mission_t_s": 21.5,
         "phase": Phase.TRACK,
         "mode": Mode.REPLAY,
+        "control": ControlMode.GOTO,
         "flight_mode": FlightMode.EXTERNAL,
         "armed": True,
         "state": STATE,

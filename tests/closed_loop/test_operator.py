@@ -9,7 +9,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
-from swarmctl.core.types import Phase
+from swarmctl.core.types import ControlMode, Phase
 from tests.closed_loop.conftest import ROOT
 
 ON_GROUND_ALONE = ("swarm.agents=1", "mission.duration_s=1")
@@ -86,6 +86,7 @@ def test_an_agent_goes_to_a_point_through_the_others_and_resume_continues_the_mi
     fly_for(flight, 2.0)
     assert np.linalg.norm(vehicle(flight)[0] - target) < 0.3, "it holds there"
     assert np.linalg.norm(vehicle(flight)[1]) < 0.3
+    assert [ControlMode(int(log.rows[-1]["control"][0])).name for log in flight.logs] == ["GOTO", "TRACKING"]
     w, x, y, z = flight.world.truth_rows()[0]["q_nb"]
     assert abs(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) - np.pi / 2) < 0.1
     fly_until(flight, lambda: phase(flight, 1) is not Phase.TRACK)

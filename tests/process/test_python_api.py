@@ -55,6 +55,8 @@ def test_what_the_page_shows_is_true(flown: tuple[Path, list[str]]) -> None:
     (told,) = (line for line in said if line.startswith("mean "))
     mean_m, largest_m = (float(number) for number in re.findall(r"[\d.]+(?= m)", told))
     assert 0.0 < mean_m < largest_m < 8.0
+    (judged,) = (line for line in said if line.startswith("agent 0: mean "))
+    assert float(judged.split()[3]) == pytest.approx(mean_m, abs=0.002)
     (paths,) = (line for line in said if " paths, " in line)
     count, ahead_s = (float(number) for number in re.findall(r"[\d.]+", paths))
     assert count > 25, "3 s of mission, fifty a second, and the way there"

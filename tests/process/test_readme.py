@@ -46,11 +46,11 @@ def shown(pattern: str) -> list[str]:
     return [line for line in SHOWN if re.search(pattern, line)]
 
 
-def run(line: str, *more: str, timeout_s: float = 400.0) -> subprocess.CompletedProcess[str]:
+def run(line: str, *more: str, timeout_s: float = 400.0, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
     command, *arguments = shlex.split(line)
     return subprocess.run(
         [str(BIN / command), *arguments, *more],
-        cwd=ROOT,
+        cwd=folder,
         env=environment(),
         capture_output=True,
         text=True,
@@ -65,7 +65,7 @@ def environment() -> dict[str, str]:
 
 def low(line: str) -> str:
     """Return the option that puts the ground 1 m below where a command's flight starts."""
-    return f"--set=sitl.ground_z_m={-1 if ' configs/' in line else 1}"
+    return f"--set=sitl.ground_z_m={-1 if '.toml' in line else 1}"
 
 
 def landed(directory: Path) -> dict[int, bool]:
@@ -75,6 +75,17 @@ def landed(directory: Path) -> dict[int, bool]:
         int(v): bool(truth["landed"][truth["vehicle"] == v][-1] == Landed.ON_GROUND)
         for v in np.unique(truth["vehicle"])
     }
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which every `config init` of the pages was run; built-in files are where they are in a checkout."""
+    folder = tmp_path_factory.mktemp("begun")
+    (folder / "configs").symlink_to(ROOT / "configs")
+    for line in shown(r"^swarmctl config init "):
+        done = run(line, folder=folder)
+        assert done.returncode == 0, done.stderr
+    return folder
 
 
 def test_nothing_is_shown_that_is_not_run() -> None:
@@ -106,18 +117,17 @@ def test_the_two_set_up_lines_install_what_they_use() -> None:
 
 
 @pytest.mark.parametrize("line", shown(r"^swarmctl simulate "))
-def test_simulations(line: str, tmp_path: Path) -> None:
-    done = run(line, "--duration", "2", "--set=sitl.start=air", "--run-dir", str(tmp_path / "run"))
+def test_simulations(line: str, begun: Path, tmp_path: Path) -> None:
+    done = run(line, "--duration", "2", "--set=sitl.start=air", "--run-dir", str(tmp_path / "run"), folder=begun)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "x real time" in done.stdout
 
 
-def test_looking_up_and_beginning_a_configuration(tmp_path: Path) -> None:
-    show, init = shown(r"^swarmctl config ")
+def test_looking_up_and_beginning_a_configuration(begun: Path) -> None:
+    (show,) = shown(r"^swarmctl config show ")
     assert "sitl.wind.mean_ned_m_s = [0.0, 0.0, 0.0]  # velocity of the air" in run(show).stdout
-    path = tmp_path / "mine.toml"
-    assert run(init, "--output", str(path)).returncode == 0
-    assert load(path) == load(ROOT / "configs" / "x500_circle.toml")
+    assert load(begun / "x500_circle.toml") == load(ROOT / "configs" / "x500_circle.toml")
+    assert {path.name for path in begun.iterdir()} > {"six_goals.toml", "own_pid.py", "figure_8.csv"}
 
 
 def test_new_keys(tmp_path: Path) -> None:
@@ -209,12 +219,12 @@ def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:
     assert "no display" in refused.stderr
 
 
-def test_own_reference_and_own_controller_are_launched(tmp_path: Path) -> None:
+def test_own_reference_and_own_controller_are_launched(begun: Path, tmp_path: Path) -> None:
     """The file is flown as it is shown, by one agent, and by a controller that each agent process has to find."""
-    (line,) = shown(r"^swarmctl launch configs/examples/")
+    (line,) = shown(r"^swarmctl launch figure_8.toml")
     directory = tmp_path / "run"
     own = ("--set=controller.kind=own_pid:Pid", "--set=sitl.start=air", "--agents", "1", "--no-view")
-    done = run(line, *own, "--duration", "2", low(line), "--run-dir", str(directory))
+    done = run(line, *own, "--duration", "2", low(line), "--run-dir", str(directory), folder=begun)
     assert done.returncode == 0, done.stdout + done.stderr
     (directory / "config.toml").rename(tmp_path / "config.toml")
     flown = load(tmp_path / "config.toml")

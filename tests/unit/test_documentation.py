@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import runpy
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -53,6 +54,22 @@ def test_every_event_is_described() -> None:
     events = re.findall(r"\b(?:_note|_say|_fail|log\.write|recorder\.event)\(\s*\"(\w+)\"", code)
     assert len(events) > 30
     assert set(events) - described() == set()
+
+
+def test_the_height_of_the_simulated_ground_is_told_where_heights_are() -> None:
+    ground_z_m = SitlParams().ground_z_m
+    tutorial, operating = ((ROOT / "docs" / f"{page}.md").read_text() for page in ("tutorial", "operating"))
+    assert f"the simulated ground is at z = {ground_z_m:g} (`sitl.ground_z_m`)" in tutorial
+    (row,) = re.findall(r"^\| `alt`, .*$", operating, re.MULTILINE)
+    assert f"ground is {ground_z_m:g} m below it (`sitl.ground_z_m`): vehicles on it are at {-ground_z_m:.1f}" in row
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_extras_that_are_to_be_installed_exist(page: Path) -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    told = re.findall(r"pip install[^`\n]*?'(?:\.|swarmctl)\[([\w,]+)\]'", page.read_text())
+    assert {extra for extras_told in told for extra in extras_told.split(",")} <= extras.keys()
+    assert page.name != "python_api.md" or told == ["pandas"]
 
 
 def test_the_table_of_orders_and_phases_is_that_of_the_code() -> None:

@@ -29,8 +29,8 @@ from swarmctl.telemetry.report.charts import (
     reference_line,
     space_view,
     time_chart,
-    top_view,
 )
+from swarmctl.telemetry.report.from_above import Place, top_view
 from swarmctl.telemetry.report.pages import render
 
 FlightName = Literal[
@@ -213,12 +213,13 @@ def obstacle_chart(traces: Sequence[Trace], points: int) -> Markup:
     return _tall_chart(title, lines, traces, limits, points=points)
 
 
-def above_chart(trace: Trace, points: int) -> Markup:
+def above_chart(trace: Trace) -> Markup:
     """Draw agents, reference and obstacles from above; circles are the keep-out and the obstacle."""
     agents = range(trace.pos_ned_m.shape[1])
     lines = [agent_line(i, trace.pos_ned_m[:, i, 1], trace.pos_ned_m[:, i, 0]) for i in agents]
     lines.append(reference_line(trace.ref_pos_ned_m[:, 0, 1], trace.ref_pos_ned_m[:, 0, 0]))
-    return top_view("From above: north up, east right [m]", lines, _balls(trace)[::-1], points)
+    ends = [Place(trace.pos_ned_m[-1, i], "", css(agent_rgb(i)), "dot") for i in agents]
+    return top_view("From above: north up, east right [m]", lines, _balls(trace)[::-1], places=ends)
 
 
 def _balls(trace: Trace) -> list[Ball]:

@@ -147,7 +147,7 @@ def _number(value: float | None) -> str:
 def _further(key: FlightName, traces: Sequence[Trace], extra: Extra, points: int) -> Iterator[Markup]:
     """Draw the charts that the thesis does not have."""
     if traces[0].obstacles:
-        yield above_chart(traces[0], points)
+        yield above_chart(traces[0])
     if key != "open_loop":
         yield error_chart(key, traces, extra.separation_m, points)
     if key in SWARMS:

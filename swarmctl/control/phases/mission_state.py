@@ -23,7 +23,7 @@ from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.phases.trajectories import OfferedMission, Trajectories
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.flight_volume import FlightVolume
-from swarmctl.core.types import Array, Command, Landed, Mode, Phase, VehicleState
+from swarmctl.core.types import Array, Command, ControlMode, Landed, Mode, Phase, VehicleState
 
 REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
 SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
@@ -160,7 +160,7 @@ class MissionState:
             return self.params.land_timeout_s - (now_us - self.entered_us) * 1e-6
         return self.duration_us * 1e-6 - self.mission_t_s(utc_us)
 
-    def control_mode(self, mode: Mode) -> str:
+    def control_mode(self, mode: Mode) -> ControlMode:
         """Return what the vehicle is doing, for the operator; `mode` is that of the tick."""
         return control_mode(
             self.phase,

@@ -41,15 +41,17 @@ def config_schema() -> int:
 
 @config_app.command("init")
 def config_init(
-    name: Annotated[str, typer.Argument(help="Built-in configuration; defaults: every key; unknown: lists all.")],
+    name: Annotated[str, typer.Argument(help="Built-in one or example; defaults: every key; unknown: lists all.")],
     output: Annotated[
-        Path | None, typer.Option("--output", metavar="FILE", help="File to create; default: NAME.toml here.")
+        Path | None,
+        typer.Option("--output", metavar="FILE", help="File to create; default: NAME.toml here."),
     ] = None,
 ) -> int:
-    """Write a commented configuration to begin with."""
+    """Write a commented configuration to begin with; of an example also the Python or CSV file that it flies."""
     from swarmctl.ops import config_help
 
-    path = output or Path(f"{name}.toml")
-    config_help.write_new(path, config_help.initial_text(name))
-    print(path)
+    texts = config_help.initial_files(name, output)
+    config_help.write_new(texts)
+    for path in texts:
+        print(path)
     return EXIT_OK

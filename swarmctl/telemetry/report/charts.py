@@ -13,16 +13,17 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from swarmctl.core.types import Array
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.report import svg
 from swarmctl.telemetry.report.svg import Axis, Figure, Stroke, dot, element
+from swarmctl.telemetry.report.thinning import evenly_spaced, thin
 
 REFERENCE_STYLE: Mapping[str, Any] = {"color": "var(--reference)", "dash": "4 3", "width": 1.1}
 _MAX_DRAWN = 1e9  # larger values come from damaged recordings and would flatten all other curves
 _BAR_PX = 21  # from one bar to the next
+_LANE_PX, _LANES, _NUMBER_PX = 15, 3, 20  # height and number of lanes of numbers above bars; width of a number
 _LOOK_RAD, _DOWN_RAD = math.radians(35), math.radians(24)  # direction of the oblique view: east of north, and down
 
 
@@ -33,7 +34,6 @@ class Line(Stroke):
     x: Array  # (T,)
     y: Array  # (T,)
     marks: bool = False  # draw a dot on every point
-    end: str = ""  # name at its end, in a view from above
 
     def __post_init__(self) -> None:
         for name in ("x", "y"):
@@ -74,6 +74,14 @@ class Span(NamedTuple):
     color: str
 
 
+class Mark(NamedTuple):
+    """A numbered upright line on a time axis: something that happened, on some of the bars."""
+
+    at: float
+    words: str
+    rows: Sequence[int]  # of the bars concerned
+
+
 class Window(NamedTuple):
     """A shaded part of a time chart: the extent of an obstacle on one axis while the reference passes through it."""
 
@@ -85,19 +93,11 @@ class Window(NamedTuple):
 
 
 class Ball(NamedTuple):
-    """A sphere in the view from above and in the oblique one, in metres."""
+    """A sphere in the view from above or the oblique one, in metres."""
 
     center_ned_m: Sequence[float]  # (3,)
     radius_m: float
     style: Literal["obstacle", "keepout"]
-
-
-class Goal(NamedTuple):
-    """A place where a reference comes to rest, in the view from above."""
-
-    pos_ned_m: Array  # (3,)
-    label: str
-    color: str
 
 
 def time_chart(
@@ -112,6 +112,7 @@ def time_chart(
     from_zero: bool = False,
     ceiling: float | None = None,
     windows: Sequence[Window] = (),
+    uprights: Sequence[float] = (),
     x_unit: str = "s",
 ) -> Figure:
     """Return a chart over time.
@@ -127,10 +128,11 @@ def time_chart(
         from_zero: whether the value axis begins at 0.
         ceiling: largest value shown; higher ones leave the plot.
         windows: shaded parts, clipped to the plot.
+        uprights: seconds at which thin upright lines are drawn.
         x_unit: unit of the axis below, if that is no time.
     """
-    low, high = _value_range([line.y for line in lines], [limit.value for limit in limits], from_zero, ceiling)
-    x, y = _axes(svg.widened(*x_range), (low, high), height)
+    low, high = value_range([line.y for line in lines], [limit.value for limit in limits], from_zero, ceiling)
+    x, y = axes(svg.widened(*x_range), (low, high), height)
     inside = [_window(window, x, y) for window in windows] + [_limit(limit, x, y) for limit in limits]
     for line in lines:
         kept_x, kept_y = thin(line.x, line.y, points)
@@ -142,39 +144,8 @@ def time_chart(
     if band is not None:
         left, right = x.clipped_px(band)
         behind = element("rect", class_="band", x=left, y=svg.TOP_PX, width=right - left, height=tall)
-    return svg.figure(title, height, [behind, svg.grid(x, y, x_unit), clipped], lines)
-
-
-def top_view(
-    title: str, lines: Sequence[Line], balls: Sequence[Ball], points: int = 600, *, goals: Sequence[Goal] = ()
-) -> Figure:
-    """Return a view from above with equal scales; x of the lines is to the right (east), y up (north)."""
-    edges = [(np.array(ball.center_ned_m), np.array([-ball.radius_m, ball.radius_m])) for ball in balls]
-    x_low, x_high = _value_range([line.x for line in lines] + [center[1] + edge for center, edge in edges])
-    y_low, y_high = _value_range([line.y for line in lines] + [center[0] + edge for center, edge in edges])
-    wide = svg.WIDTH_PX - svg.LEFT_PX - svg.RIGHT_PX
-    scale = min(wide / (x_high - x_low), 420 / (y_high - y_low))  # pixels per metre
-    height = max(160.0, (y_high - y_low) * scale + svg.TOP_PX + svg.BOTTOM_PX)
-    more_x = (wide / scale - (x_high - x_low)) / 2
-    more_y = ((height - svg.TOP_PX - svg.BOTTOM_PX) / scale - (y_high - y_low)) / 2
-    x, y = _axes((x_low - more_x, x_high + more_x), (y_low - more_y, y_high + more_y), height)
-    parts, marks = [svg.grid(x, y)], list[str]()
-    for ball in balls:
-        center = {"cx": float(x.px(ball.center_ned_m[1])), "cy": float(y.px(ball.center_ned_m[0]))}
-        parts.append(element("circle", class_="obstacle", **center, r=float(ball.radius_m * scale)))
-    for line in lines:
-        kept = _evenly_spaced(len(line.x), points)
-        parts.append(_curve(line, x, y, line.x[kept], y_values=line.y[kept]))
-        if line.label and not line.dash and len(line.x) and np.isfinite(line.y[-1]):
-            at = float(x.px(line.x[-1])), float(y.px(line.y[-1]))
-            parts.append(dot(*at, 4, line.color))
-            marks += [svg.mark(at[0] + 7, at[1] - 8, line.end)] if line.end else []
-    for goal in goals:
-        cx, cy = float(x.px(goal.pos_ned_m[1])), float(y.px(goal.pos_ned_m[0]))
-        ring = element("circle", cx=cx, cy=cy, r="7", fill="none", stroke=goal.color, stroke_width="2")
-        parts.append(ring)
-        marks.append(svg.mark(cx + 11, cy + 10, goal.label))
-    return svg.figure(title, height, [*parts, *marks], lines)
+    stood = _uprights([float(x.px(at)) for at in uprights], svg.TOP_PX, y.first)
+    return svg.figure(title, height, [behind, svg.grid(x, y, x_unit), stood, clipped], lines)
 
 
 def space_view(title: str, lines: Sequence[SpaceLine], balls: Sequence[Ball] = (), points: int = 600) -> Figure:
@@ -185,10 +156,10 @@ def space_view(title: str, lines: Sequence[SpaceLine], balls: Sequence[Ball] = (
     """
     spread = [line.pos_ned_m for line in lines]
     spread += [np.array([ball.center_ned_m]) + side * ball.radius_m for ball in balls for side in (-1, 1)]
-    view = _Oblique([_value_range([pos[:, k] for pos in spread]) for k in range(3)], may_stretch=not balls)
+    view = _Oblique([value_range([pos[:, k] for pos in spread]) for k in range(3)], may_stretch=not balls)
     drawn, nearer = [], []
     for line in lines:
-        pos_ned_m = line.pos_ned_m[_evenly_spaced(len(line.pos_ned_m), points)]  # (K, 3)
+        pos_ned_m = line.pos_ned_m[evenly_spaced(len(line.pos_ned_m), points)]  # (K, 3)
         px, py = view.px(pos_ned_m)
         drawn.append(line.along(px, py))
         if balls:
@@ -266,49 +237,56 @@ class _Oblique:
         return svg.tick(px + right, py + below, text, anchor)
 
 
-def state_bars(title: str, rows: Sequence[tuple[str, Sequence[Span]]], x_range: tuple[float, float]) -> Figure:
-    """Return one bar for each row, coloured by state."""
+def state_bars(
+    title: str,
+    rows: Sequence[tuple[str, Sequence[Span]]],
+    x_range: tuple[float, float],
+    *,
+    marks: Sequence[Mark] = (),
+) -> Figure:
+    """Return one bar for each row, coloured by state, and marks across them, in order of time."""
     low, high = svg.widened(*x_range)
     x = Axis(low=low, high=high, first=svg.LEFT_PX + 40, last=svg.WIDTH_PX - svg.RIGHT_PX)
-    parts, states = [], {}
+    at_px = [float(x.px(mark.at)) for mark in marks]
+    lanes = _lanes(at_px)
+    top = svg.TOP_PX + _LANE_PX * (max(lanes, default=-1) + 1)
+    parts, states = list[Markup](), {}
     for number, (label, spans) in enumerate(rows):
-        top = svg.TOP_PX + _BAR_PX * number
-        parts.append(svg.tick(svg.LEFT_PX + 34, top + 8, label, "end"))
+        bar_top = top + _BAR_PX * number
+        parts.append(svg.tick(svg.LEFT_PX + 34, bar_top + 8, label, "end"))
         for span in spans:
             left, right = map(float, x.px(np.array([span.start, span.end])))
             states[span.name] = Stroke(color=span.color, label=span.name)
             words = element("title", f"{span.name} {span.start:.1f} to {span.end:.1f} s")
-            place = {"x": left, "y": top, "width": max(0.6, right - left), "height": 16}
+            place = {"x": left, "y": bar_top, "width": max(0.6, right - left), "height": 16}
             parts.append(element("rect", words, **place, fill=span.color))
-    height = svg.TOP_PX + _BAR_PX * len(rows) + svg.BOTTOM_PX
+    for number, (mark, px, lane) in enumerate(zip(marks, at_px, lanes, strict=True), 1):
+        tops = [top + _BAR_PX * row for row in mark.rows]
+        path = "".join(f"M{px:.1f} {bar_top - 2}v20" for bar_top in tops)
+        parts.append(element("path", class_="moment", d=path))
+        parts.append(svg.tick(px, svg.TOP_PX + _LANE_PX * (lane + 0.4), f"{number}", "middle"))
+    height = top + _BAR_PX * len(rows) + svg.BOTTOM_PX
     parts.append(svg.axis_below(x, Axis(low=0.0, high=1.0, first=height - svg.BOTTOM_PX, last=svg.TOP_PX), "s"))
-    return svg.figure(title, height, parts, states.values())
+    said = [
+        Stroke(color="", label=f"{k} {mark.words}, {mark.at:.1f} s", sign="text") for k, mark in enumerate(marks, 1)
+    ]
+    return svg.figure(title, height, parts, [*states.values(), *said])
 
 
-def thin(x: Array, y: Array, points: int) -> tuple[Array, Array]:
-    """Return at most `points` points of a curve (T,), with the smallest and largest value of every part."""
-    if len(x) <= points:
-        return x, y
-    buckets = np.array_split(np.arange(len(x)), max(1, points // 2))
-    kept: list[int] = []
-    for bucket in buckets:
-        values = y[bucket]
-        if not np.isfinite(values).any():
-            kept.append(int(bucket[0]))
-            continue
-        kept += sorted({int(bucket[np.nanargmin(values)]), int(bucket[np.nanargmax(values)])})
-    chosen = np.array(kept)
-    return x[chosen], y[chosen]
+def _lanes(at_px: Sequence[float]) -> list[int]:
+    """Return for each number, from the left, the lowest lane in which it is clear of the one before."""
+    ends_px, lanes = [-math.inf] * _LANES, []
+    for px in at_px:
+        lane = next((k for k, end_px in enumerate(ends_px) if px >= end_px), _LANES - 1)
+        ends_px[lane] = px + _NUMBER_PX
+        lanes.append(lane)
+    return lanes
 
 
-def _axes(x_range: tuple[float, float], y_range: tuple[float, float], height: float) -> tuple[Axis, Axis]:
+def axes(x_range: tuple[float, float], y_range: tuple[float, float], height: float) -> tuple[Axis, Axis]:
+    """Return the axes of a drawing of a height [px]."""
     x = Axis(low=x_range[0], high=x_range[1], first=svg.LEFT_PX, last=svg.WIDTH_PX - svg.RIGHT_PX)
     return x, Axis(low=y_range[0], high=y_range[1], first=height - svg.BOTTOM_PX, last=svg.TOP_PX)
-
-
-def _evenly_spaced(count: int, points: int) -> NDArray[np.intp]:
-    """Return at most `points` indices (K,), evenly spread over `count`."""
-    return np.unique(np.linspace(0, max(0, count - 1), min(points, count)).astype(np.intp))
 
 
 def _curve(line: Line, x: Axis, y: Axis, x_values: Array, *, y_values: Array) -> Markup:
@@ -324,6 +302,11 @@ def _window(window: Window, x: Axis, y: Axis) -> Markup:
     return element("rect", class_=window.style, x=left, y=top, width=right - left, height=bottom - top)
 
 
+def _uprights(at_px: Sequence[float], top: float, bottom: float) -> Markup:
+    path = "".join(f"M{px:.1f} {top:.1f}V{bottom:.1f}" for px in at_px)
+    return element("path", class_="upright", d=path) if path else Markup()
+
+
 def _limit(limit: Limit, x: Axis, y: Axis) -> Markup:
     py = float(y.px(limit.value))
     place = {"d": f"M{x.first} {py:.1f}H{x.last}", "stroke_width": "1.2", "stroke_dasharray": "5 4"}
@@ -332,12 +315,13 @@ def _limit(limit: Limit, x: Axis, y: Axis) -> Markup:
     return Markup("").join([line, name])
 
 
-def _value_range(
+def value_range(
     values: Sequence[Array],
     extra: Sequence[float] = (),
     from_zero: bool = False,
     ceiling: float | None = None,
 ) -> tuple[float, float]:
+    """Return a range in which all finite values have room."""
     finite = [array[np.isfinite(array)] for array in values]
     known = [*extra, *(float(f(array)) for array in finite if len(array) for f in (np.min, np.max))]
     low, high = (min(known), max(known)) if known else (0.0, 1.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -11,42 +11,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.closest_pair import closest_pair_m
-from swarmctl.core.tick_record import CURVES, Curve
-from swarmctl.core.types import Array, Mode, Phase, PlanStatus
+from swarmctl.core.tick_record import CURVES, NOT_RECORDED, Curve
+from swarmctl.core.types import Array, ControlMode, Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
-from swarmctl.telemetry.evaluation.referee import Rules, RunData
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunData
 from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
     goal_ned_m,
     merge_tracks,
     mission_start_us,
+    missions,
     newest_mission,
     shared_references,
     track_error,
     tracking_rows,
     true_positions,
+    unbroken_mission_t_s,
 )
-from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, PLAN_RGB, SUM_RGB, agent_rgb, css
+from swarmctl.telemetry.palette import CONTROL_RGB, MODE_RGB, PHASE_RGB, PLAN_RGB, SUM_RGB, agent_rgb, css
 from swarmctl.telemetry.report.charts import (
     REFERENCE_STYLE,
     Ball,
-    Goal,
     Limit,
     Line,
+    Mark,
     Span,
     agent_line,
     reference_line,
     state_bars,
     time_chart,
-    top_view,
 )
-from swarmctl.telemetry.report.svg import Figure
+from swarmctl.telemetry.report.from_above import Place, top_view
+from swarmctl.telemetry.report.moments import moments, who
+from swarmctl.telemetry.report.svg import Figure, Stroke
 
 DETAILED_AGENTS = 6  # number of agents with attitude charts
 _ALL_POINTS = 42_000  # points of all lines together, 13 bytes each: keeps the page below 1 MB
 IN_FLIGHT = "from arming on"  # what is counted in a flight: its verdict leaves out what was before
 _ALL_REFERENCES = reference_line(np.zeros(0), np.zeros(0))  # for the legend: each is in the colour of its agent
+_NEAR_M = 0.5  # how far beside what was flown the way of an obstacle is drawn
+_TRANSIT: dict[str, Any] = {"width": 1.2, "opacity": 0.45}  # to the mission and back
+_LEGEND_ABOVE = (
+    _ALL_REFERENCES,
+    Stroke(color="var(--soft)", label="mission"),
+    Stroke(color="var(--soft)", label="way out and back", opacity=_TRANSIT["opacity"]),
+)
 
 
 class RunCharts:
@@ -64,33 +74,67 @@ class RunCharts:
         self._start_us = first_us if start_us is None else start_us
         ends = [self._seconds(rows[[0, -1]]) for rows in run.ticks.values() if len(rows)]
         self._range = (min(e[0] for e in ends), max(e[1] for e in ends)) if ends else (0.0, 1.0)
-        missions = [self._seconds(rows[[0, -1]]) for rows in map(tracking_rows, run.ticks.values()) if len(rows)]
-        self._band = (min(m[0] for m in missions), max(m[1] for m in missions)) if missions else None
+        flown = [self._seconds(rows[[0, -1]]) for rows in map(tracking_rows, run.ticks.values()) if len(rows)]
+        self._band = (min(m[0] for m in flown), max(m[1] for m in flown)) if flown else None
         self._agents = sorted(agent for agent in run.ticks if agent < agents)
         self._references = shared_references({agent: run.ticks[agent] for agent in self._agents})
         lines = (12 + len(CURVES)) * len(self._agents) + 6 * min(DETAILED_AGENTS, len(self._agents)) + 8
         self._points = int(np.clip(_ALL_POINTS // lines, 40, 600))
+        self.moments = moments(run.events, {k: run.ticks[k] for k in self._agents}, self.time_of, self._seconds)
 
     def _seconds(self, rows: NDArray[np.void]) -> Array:
         return np.asarray((rows[self._time_field] - self._start_us) / 1e6, np.float64)
 
     def _chart(self, title: str, lines: list[Line], **options: Any) -> Figure:
-        return time_chart(title, lines, self._range, band=self._band, points=self._points, **options)
+        uprights = [moment.at_s for moment in self.moments]
+        return time_chart(title, lines, self._range, band=self._band, points=self._points, uprights=uprights, **options)
+
+    def flown_missions(self) -> tuple[int, float]:
+        """Return how many missions an agent has flown one after the other, at most, and for how long together [s]."""
+        flown = [self._run.ticks[agent] for agent in self._agents]
+        times_s = [unbroken_mission_t_s(tracking_rows(rows)) for rows in flown]
+        counts = (len(missions(rows)) for rows in flown)
+        return max(counts, default=0), max((float(t_s[-1]) for t_s in times_s if len(t_s)), default=0.0)
 
     def seen_from_above(self) -> Figure:
-        lines, goals = [_ALL_REFERENCES, *(self._reference(agent, 1, 0, width=1.6) for agent in self._references)], []
+        lines = [self._reference(agent, 1, 0, width=1.6) for agent in self._references]
+        places, flown = list[Place](), list[Array]()
         for agent in self._agents:
             rows = flight_rows(self._run.ticks[agent])
             pos_ned_m = true_positions(rows, self._run.truth, agent)
-            lines.append(agent_line(agent, pos_ned_m[:, 1], pos_ned_m[:, 0], width=1.6, end=f"{agent}"))
+            in_mission = rows["phase"] == Phase.TRACK
+            for drawn, style in ((~in_mission, {"label": "", **_TRANSIT}), (in_mission, {"width": 1.8})):
+                part_ned_m = np.where(drawn[:, None], pos_ned_m, np.nan)
+                lines.append(agent_line(agent, part_ned_m[:, 1], part_ned_m[:, 0], **style))
+            flown.append(pos_ned_m[np.isfinite(pos_ned_m).all(axis=1)])
+            places += [Place(end_ned_m, f"end {agent}", css(agent_rgb(agent)), "dot") for end_ned_m in flown[-1][-1:]]
         for agent, group in self._references.items():
             place_ned_m = goal_ned_m(newest_mission(self._run.ticks[agent]))
             if place_ned_m is not None:
                 name = "goal" if self._is_shared else f"goal {', '.join(map(str, group))}"
-                goals.append(Goal(place_ned_m, name, self._color_of(agent)))
-        obstacles = [judged.obstacle for judged in self._rules.obstacles] if self._rules else []
-        balls = [Ball(obstacle.center_ned_m, obstacle.keep_out_m, "keepout") for obstacle in obstacles]
-        return top_view("From above: north up, east right [m]", lines, balls, self._points, goals=goals)
+                places.append(Place(place_ned_m, name, self._color_of(agent), "ring"))
+        obstacles = self._rules.obstacles if self._rules else ()
+        balls = [Ball(judged.obstacle.center_ned_m, judged.obstacle.keep_out_m, "keepout") for judged in obstacles]
+        balls += [Ball(judged.obstacle.center_ned_m, judged.obstacle.radius_m, "obstacle") for judged in obstacles]
+        lines += self._ways(obstacles, np.concatenate([np.zeros((0, 3)), *flown]))
+        return top_view("From above: north up, east right [m]", lines, balls, places=places, legend=_LEGEND_ABOVE)
+
+    def _ways(self, obstacles: Iterable[JudgedObstacle], flown_ned_m: Array) -> Iterator[Line]:
+        """Yield the ways of moving obstacles from where they are drawn, while they are near what was flown (T, 3)."""
+        utc_us = [int(rows["utc_us"][end]) for rows in self._run.ticks.values() if len(rows) for end in (0, -1)]
+        label = "way of an obstacle"
+        for judged in obstacles:
+            if not (judged.obstacle.moves and utc_us and len(flown_ned_m)):
+                continue
+            begin_us = min(utc_us) if judged.since_utc_us is None else judged.since_utc_us
+            end_us = max(utc_us) if judged.until_utc_us is None else judged.until_utc_us
+            elapsed_s = np.linspace(0.0, max(0.0, (end_us - begin_us) * 1e-6), 500)
+            way_ned_m = judged.obstacle.center_after(elapsed_s[:, None])
+            near = way_ned_m > flown_ned_m.min(axis=0) - _NEAR_M
+            near &= way_ned_m < flown_ned_m.max(axis=0) + _NEAR_M
+            way_ned_m[~near[:, :2].all(axis=1)] = np.nan
+            yield Line(x=way_ned_m[:, 1], y=way_ned_m[:, 0], color="var(--danger)", label=label, width=1.6)
+            label = ""
 
     @property
     def _is_shared(self) -> bool:
@@ -102,17 +146,31 @@ class RunCharts:
 
     def _reference(self, agent: int, x: int | None, y: int, **style: Any) -> Line:
         """Return the curve of a reference: one component over time (`x` None) or over another."""
-        rows = tracking_rows(self._run.ticks[agent])
-        across = self._seconds(rows) if x is None else rows["ref_pos_ned_m"][:, x]
-        return reference_line(across, rows["ref_pos_ned_m"][:, y], "", color=self._color_of(agent), **style)
+        flown = missions(self._run.ticks[agent])
+        rows = np.concatenate(flown)  # none, if there was no mission
+        ref_pos_ned_m = rows["ref_pos_ned_m"].copy()
+        ref_pos_ned_m[np.cumsum([len(mission) for mission in flown[:-1]], dtype=np.intp)] = np.nan  # each by itself
+        across = self._seconds(rows) if x is None else ref_pos_ned_m[:, x]
+        return reference_line(across, ref_pos_ned_m[:, y], "", color=self._color_of(agent), **style)
 
     def flight(self) -> Iterator[Figure]:
         yield self._tracking_error()
         yield self._separation()
         yield from filter(None, (self._curve(name, curve) for name, curve in CURVES.items()))
         yield state_bars("Phase of the mission", self._spans("phase", Phase, PHASE_RGB), self._range)
-        yield state_bars("What the agent did", self._spans("mode", Mode, MODE_RGB), self._range)
+        yield self._control()
         yield state_bars("What became of its plans", self._spans("plan_status", PlanStatus, PLAN_RGB), self._range)
+
+    def _control(self) -> Figure:
+        """Return what the agents did in the words of the operator's table, or in their modes where those lack."""
+        recorded = any((self._run.ticks[agent]["control"] != NOT_RECORDED).any() for agent in self._agents)
+        spans = self._spans("control", ControlMode, CONTROL_RGB) if recorded else self._spans("mode", Mode, MODE_RGB)
+        rows = {agent: row for row, agent in enumerate(self._agents)}
+        marks = [
+            Mark(at_s, words + who(agents, len(rows)), [rows[agent] for agent in agents])
+            for at_s, words, agents in self.moments
+        ]
+        return state_bars("What the agent did", spans, self._range, marks=marks)
 
     def positions(self) -> Iterator[Figure]:
         for k, axis in enumerate(("x north", "y east", "z down")):

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 from swarmctl.files import replace_bytes, replace_text
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR, Rules, RunData
 from swarmctl.telemetry.palette import agent_rgb, css
+from swarmctl.telemetry.report.event_table import event_rows
+from swarmctl.telemetry.report.moments import ordinal
 from swarmctl.telemetry.report.pages import render
 from swarmctl.telemetry.report.png import png_of
 from swarmctl.telemetry.report.run_charts import IN_FLIGHT, RunCharts
@@ -35,16 +37,21 @@ def write_report(
         rules: limits and obstacles to draw, in addition to those in `summary`.
     """
     charts, path = RunCharts(run, summary, rules), directory / REPORT
+    events = list(event_rows(run.events, charts.time_of))
+    missions, tracked_s = charts.flown_missions()
     page = render(
         __package__,
         "report.html",
         name=directory.resolve().name,
         summary=summary,
+        flown=_flown(summary, missions, tracked_s),
+        several_missions=missions > 1,
+        has_moments=bool(charts.moments),
         rows=summary_rows(summary, rules),
         seen_from_above=charts.seen_from_above(),
         sections=_sections(charts),
-        events=_event_rows(run, charts),
-        events_hidden=max(0, len(run.events) - _EVENTS_LISTED),
+        events=events[:_EVENTS_LISTED],
+        events_hidden=max(0, len(events) - _EVENTS_LISTED),
         config_text=config_text,
         agent_css=lambda agent: css(agent_rgb(agent)),
         number=_figure,
@@ -91,13 +98,12 @@ class SummaryRow(NamedTuple):
     note: str = ""  # what it is
 
 
-def _event_rows(run: RunData, charts: RunCharts) -> Iterator[tuple[str, object, object, str]]:
-    """Yield seconds, source, name and fields of the first events."""
-    for event in run.events[:_EVENTS_LISTED]:
-        seconds = charts.time_of(event)
-        rest = ", ".join(f"{k}={v}" for k, v in event.items() if k not in ("utc_us", "t_us", "source", "event"))
-        at = "" if seconds is None else f"{seconds:.2f}"
-        yield at, event.get("source", ""), event.get("event", ""), rest[:300]
+def _flown(summary: Mapping[str, Any], missions: int, tracked_s: float) -> str:
+    """Return for how long the mission was flown; of several, the newest and all together."""
+    duration = _figure(summary["duration_s"], "s", 1)
+    if missions < 2:
+        return f"{duration} of mission time"
+    return f"{duration} of the {ordinal(missions)} mission, {tracked_s:.1f} s in TRACK"
 
 
 def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[SummaryRow]:
@@ -114,7 +120,10 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     late = f"{timing['late_ticks']} of {due}"
     limit = "" if most is None else f"{most:.0%}"
     yield SummaryRow(f"deadline misses {IN_FLIGHT}", late, limit, good, timing["late_ticks"])
-    named = ("summed mean tracking error", "index_m", SUMMED_ERROR), ("the same after 10 s", "index_after_10s_m", "")
+    named = (
+        ("summed mean tracking error", "index_m", SUMMED_ERROR),
+        ("the same after 10 s", "index_after_10s_m", "without the first 10 s in TRACK"),
+    )
     for name, key, note in named:
         error_m = summary["tracking"][key]
         yield SummaryRow(name, _figure(error_m, "m", 3), number=error_m, note=note)

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
 from markupsafe import Markup
@@ -20,7 +21,8 @@ from swarmctl.telemetry.report.pages import render
 WIDTH_PX = 640
 LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 62, 12, 8, 30  # margins around the plot: texts grow on narrow screens
 _VARIABLE = re.compile(r"var\((--[a-z-]+)\)")
-_LEGEND_PX, _CHARACTER_PX = 18, 6.5  # of a figure as a file: height of a row of its legend, width of a character
+CHARACTER_PX = 6.5  # width of a character
+_LEGEND_PX, _KEY_PX = 18, 18  # of a legend: height of a row in a file, width of a sign
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,11 +34,24 @@ class Stroke:
     dash: str = ""
     width: float = 1.4
     opacity: float = 1.0
+    sign: Literal["line", "dot", "ring", "obstacle", "keepout", "text"] = "line"  # in the legend
 
     def along(self, px: Array, py: Array) -> Markup:
         """Return the path through points (T,) in pixels; NaN interrupts it."""
         style = {"stroke": self.color, "stroke_width": f"{self.width:g}", "stroke_dasharray": self.dash}
         return polyline(px, py, **style, opacity="" if self.opacity >= 1 else f"{self.opacity:g}")
+
+    def sample(self, px: float, py: float) -> Markup:
+        """Return the sign of the legend, whose left edge, half way up, is at a point."""
+        middle_px = px + _KEY_PX / 2
+        if self.sign == "line":
+            return self.along(np.array([px, px + _KEY_PX]), np.array([py, py]))
+        if self.sign == "dot":
+            return dot(middle_px, py, 4, self.color)
+        if self.sign == "ring":
+            return ring(middle_px, py, 4, self.color)
+        place = {"x": px + 2, "y": py - 5, "width": _KEY_PX - 4.0, "height": 10.0}
+        return element("rect", class_=self.sign, **place, rx="3")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,14 +99,19 @@ def dot(px: float, py: float, radius: float, color: str) -> Markup:
     return element("circle", cx=px, cy=py, r=f"{radius:g}", fill=color)
 
 
+def ring(px: float, py: float, radius: float, color: str) -> Markup:
+    """Return a circle."""
+    return element("circle", cx=px, cy=py, r=f"{radius:g}", fill="none", stroke=color, stroke_width="2")
+
+
 def tick(px: float, py: float, text: str, anchor: str) -> Markup:
     """Return a small text whose `anchor` (start, middle, end), half way up, is at a point."""
     return element("text", text, class_="tick", x=px, y=py, dy=".32em", text_anchor=anchor)
 
 
-def mark(px: float, py: float, text: str) -> Markup:
-    """Return a small text that begins at a point and is read over lines."""
-    return element("text", text, class_="tick mark", x=px, y=py, dy=".32em")
+def mark(px: float, py: float, text: str, anchor: str) -> Markup:
+    """Return a small text whose `anchor` is at a point, which is read over lines."""
+    return element("text", text, class_="tick mark", x=px, y=py, dy=".32em", text_anchor=anchor)
 
 
 def grid(x: Axis, y: Axis, x_unit: str = "") -> Markup:
@@ -159,14 +179,16 @@ def figure(title: str, height_px: float, parts: Iterable[str], legend: Iterable[
 
 
 def _legend_keys(legend: Sequence[Stroke], top_px: float) -> tuple[Markup, int]:
-    """Return line and name of every stroke, in rows from `top_px` down, and the number of rows."""
+    """Return sign and name of every stroke, in rows from `top_px` down, and the number of rows."""
     keys, px, row = [], float(LEFT_PX), 0
     for key in legend:
-        width_px = 38 + _CHARACTER_PX * len(key.label)
+        sign_px = 0 if key.sign == "text" else _KEY_PX + 5
+        width_px = sign_px + 15 + CHARACTER_PX * len(key.label)
         if px + width_px > WIDTH_PX and px > LEFT_PX:
             px, row = float(LEFT_PX), row + 1
         py = top_px + _LEGEND_PX * row
-        keys += [key.along(np.array([px, px + 18]), np.array([py, py])), tick(px + 23, py, key.label, "start")]
+        keys += [key.sample(px, py)] if sign_px else []
+        keys.append(tick(px + sign_px, py, key.label, "start"))
         px += width_px
     return Markup("").join(keys), row + 1 if legend else 0
 

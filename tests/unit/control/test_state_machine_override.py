@@ -50,7 +50,7 @@ def test_a_takeover_after_setpoints_stopped_is_called_overload(stopped: str, con
     flight.run(0.1)
     told = f"{STOPPED}: the autopilot took over" if stopped else "pilot or autopilot took over"
     assert flight.mission.outcome == told
-    assert flight.mission.control_mode(Mode.PILOT_OVERRIDE) == control
+    assert flight.mission.control_mode(Mode.PILOT_OVERRIDE).name == control
     flight.setpoints_stopped, flight.failsafe_mode = "", Mode.PRIMING
     flight.run(10.0)
     assert flight.mission.outcome == told, "for as long as it lasts"

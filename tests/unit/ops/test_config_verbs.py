@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from swarmctl.config import Config, load
+from swarmctl.config import Config, load, load_mission
 from swarmctl.config_problems import all_keys
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops import config_help
@@ -104,7 +104,7 @@ def alternatives(node: dict[str, Any], root: dict[str, Any]) -> Iterator[dict[st
 
 
 def test_the_file_of_all_keys_sets_nothing_and_states_every_default(tmp_path: Path) -> None:
-    text = config_help.initial_text("defaults")
+    (text,) = config_help.initial_files("defaults").values()
     (tmp_path / "defaults.toml").write_text(text)
     assert load(tmp_path / "defaults.toml") == Config()
     own = [part for part in text.split("\n\n") if not part.startswith("#[[")]  # an item of a list has required keys
@@ -117,15 +117,44 @@ def test_the_file_of_all_keys_sets_nothing_and_states_every_default(tmp_path: Pa
 
 def test_a_built_in_file_is_written_with_its_comments_and_overwrites_nothing(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    config_help.write_new(path, config_help.initial_text("x500_circle"))
+    config_help.write_new(config_help.initial_files("x500_circle", path))
     assert load(path) == load(ROOT / "configs" / "x500_circle.toml")
     assert "#" in path.read_text()
     with pytest.raises(ConfigError, match="exists already"):
-        config_help.write_new(path, "")
+        config_help.write_new({tmp_path / "other.toml": "", path: ""})
+    assert not (tmp_path / "other.toml").exists(), "all or none"
     with pytest.raises(StartError, match="can't be written"):
-        config_help.write_new(tmp_path / "no" / "where.toml", "")
-    with pytest.raises(ConfigError, match=r"known are .*x500_circle"):
-        config_help.initial_text("x501")
+        config_help.write_new({tmp_path / "no" / "where.toml": ""})
+    with pytest.raises(ConfigError, match=r"known are .*figure_8, .*own_pid, .*x500_circle"):
+        config_help.initial_files("x501")
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "configs" / "examples").glob("*.toml")))
+def test_an_example_comes_with_what_it_flies_and_is_checked_where_it_was_written(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    texts = config_help.initial_files(name)
+    config_help.write_new(texts)
+    beside = {path.name for path in (ROOT / "configs" / "examples").glob(f"{name}.*")}
+    assert {path.name for path in tmp_path.iterdir()} == beside
+    assert f"configs/examples/{name}" not in "".join(texts.values()), "what it says is to be typed is about the copy"
+    if name == "figure_8_mission":
+        load_mission(load(None), tmp_path / f"{name}.toml")
+        return
+    copied, own = load(tmp_path / f"{name}.toml"), load(ROOT / "configs" / "examples" / f"{name}.toml")
+    assert (copied.name, copied.mission.kind, copied.controller.kind) == (
+        own.name,
+        own.mission.kind,
+        own.controller.kind,
+    )
+
+
+def test_the_files_of_an_example_go_where_the_first_goes(tmp_path: Path) -> None:
+    config_help.write_new(config_help.initial_files("own_pid", tmp_path / "mine.toml"))
+    assert {path.name for path in tmp_path.iterdir()} == {"mine.toml", "own_pid.py"}
+    assert load(tmp_path / "mine.toml").controller.kind == "own_pid:Pid"
+    assert list(config_help.initial_files("steer_swarm")) == [Path("steer_swarm.py")]
 
 
 def test_the_verbs_of_the_command_line(tmp_path: Path) -> None:

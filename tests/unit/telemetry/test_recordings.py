@@ -18,11 +18,11 @@ from swarmctl.core.frames import euler_from_quat, quat_from_euler
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.tick_record import COLUMNS
-from swarmctl.core.types import Mode, Phase
+from swarmctl.core.types import ControlMode, Mode, Phase
 from swarmctl.errors import StartError
 from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
 from swarmctl.telemetry.evaluation.referee import RunData
-from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, agent_rgb
+from swarmctl.telemetry.palette import CONTROL_RGB, MODE_RGB, PHASE_RGB, agent_rgb
 from swarmctl.telemetry.scene.quad_mesh import quad_glb
 from swarmctl.telemetry.scene.separation_feed import SeparationFeed
 from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
@@ -195,5 +195,6 @@ def test_roll_and_pitch_of_many_agree_with_those_of_one() -> None:
 def test_every_state_and_agent_has_a_colour() -> None:
     assert set(PHASE_RGB) == {phase.name for phase in Phase}
     assert set(MODE_RGB) == {mode.name for mode in Mode}
+    assert set(CONTROL_RGB) == {mode.name for mode in ControlMode}
     colours = [agent_rgb(agent) for agent in range(30)]
     assert len(set(colours)) == 30

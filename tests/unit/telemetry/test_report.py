@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import sys
@@ -9,13 +10,14 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
 from swarmctl.config import Config, dump, load_recorded
 from swarmctl.core.tick_record import CURVES
-from swarmctl.core.types import Phase
+from swarmctl.core.types import ControlMode, Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.verbs.folders import report
 from swarmctl.telemetry.evaluation.tracks import shared_references
@@ -23,9 +25,13 @@ from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.recording.run_files import load_run
 from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
 from swarmctl.telemetry.report import svg
+from swarmctl.telemetry.report.charts import Line
 from swarmctl.telemetry.report.comparison import differences
+from swarmctl.telemetry.report.event_table import event_rows
+from swarmctl.telemetry.report.from_above import Place, top_view
 from swarmctl.telemetry.report.run_charts import RunCharts
-from tests.unit.telemetry.test_run_folder import flight, write_run
+from swarmctl.telemetry.report.thinning import shape_of
+from tests.unit.telemetry.test_run_folder import UTC_US, flight, write_run
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -78,7 +84,7 @@ def test_every_agent_has_its_own_reference_and_goal(folder: Path) -> None:
         assert dashed(drawn[title]) == colors, title
     above = drawn["From above: north up, east right [m]"]
     assert re.findall(r">(goal[^<]*)</text>", above) == ["goal 0", "goal 1", "goal 2"]
-    assert re.findall(r'<circle [^>]*fill="none" stroke="([^"]+)"', above) == colors
+    assert re.findall(r'<circle [^>]*r="7" fill="none" stroke="([^"]+)"', above) == colors
 
 
 def test_a_reference_that_all_share_is_drawn_once_and_one_that_moves_on_is_no_goal(shared: Path) -> None:
@@ -86,6 +92,142 @@ def test_a_reference_that_all_share_is_drawn_once_and_one_that_moves_on_is_no_go
     for title in ("From above: north up, east right [m]", "x north [m]"):
         assert dashed(drawn[title]) == ["var(--reference)"], title
     assert "goal" not in drawn["From above: north up, east right [m]"]
+
+
+def operators_flight(directory: Path) -> Path:
+    """Write a run of three agents with orders: all are held, agent 1 goes to a point, all fly a second mission."""
+    finish(directory, seconds=16.0)
+    for agent, rows in load_run(directory).ticks.items():
+        t_s = (rows["t_us"] - rows["t_us"][0]) * 1e-6  # the mission begins at 3 s
+        rows["control"][(t_s >= 5) & (t_s < 6)] = ControlMode.HOLD
+        rows["control"][(t_s >= 7) & (t_s < 8)] = ControlMode.GOTO if agent == 1 else ControlMode.TRACKING
+        again = (t_s >= 9) & (rows["phase"] == Phase.TRACK)
+        rows["mission_t_s"][again] = t_s[again] - 10.0
+        rows.tofile(directory / f"agent-{agent}.ticks")
+    orders: tuple[tuple[float, str, tuple[int, ...], dict[str, float]], ...] = (
+        (5.0, "hold", (0, 1, 2), {}),
+        (6.0, "resume", (0, 1, 2), {}),
+        (7.0, "goto", (1,), {"north_m": 4.0, "east_m": 0.0, "down_m": -5.0}),
+        (9.0, "mission", (0, 1, 2), {}),
+        (16.0, "exclude", (0, 1), {"peer": 2.0}),
+    )
+    lines = []
+    for at_s, verb, agents, arguments in orders:
+        for agent in agents:
+            t_us = 5_000_000 + round(at_s * 1e6) + 20_000 * agent
+            stamp = {"t_us": t_us, "utc_us": t_us + UTC_US, "source": f"agent-{agent}", "event": "operator"}
+            lines.append(json.dumps({**stamp, "verb": verb, **arguments}))
+    (directory / "orders.events.jsonl").write_text("\n".join(lines) + "\n")
+    (directory / "summary.json").unlink()
+    finish_run(directory, Config().rules(), Outcome(outcome="completed"))
+    return directory
+
+
+def legend(figure: str) -> list[str]:
+    return re.findall(r"<span>(?:<i .*?</i>|<svg .*?</svg>)?([^<]+)</span>", figure)
+
+
+def test_orders_and_further_missions_are_marked_and_told_apart(tmp_path: Path) -> None:
+    page = (operators_flight(tmp_path / "operated") / "report.html").read_text()
+    assert ", 5.0 s of the second mission, 12.0 s in TRACK. Times count from the start of the first mission;" in page
+    drawn = figures(page)
+    did = drawn["What the agent did"]
+    assert legend(did) == [
+        *("AUTO", "TRACKING", "HOLD", "GOTO"),
+        *("1 hold, 2.0 s", "2 resume, 3.0 s", "3 goto 4, 0, -5 (agent 1), 4.0 s"),
+        *("4 mission set, 6.0 s", "5 second mission begins, 7.0 s"),
+    ]
+    assert re.findall(r"<title>(?:HOLD|GOTO) [^<]*</title>", did) == [
+        *("<title>HOLD 2.0 to 3.0 s</title>",) * 2,
+        *("<title>GOTO 4.0 to 5.0 s</title>", "<title>HOLD 2.0 to 3.0 s</title>"),
+    ]
+    bars = [path.count("M") for path in re.findall(r'<path class="moment" d="([^"]*)"', did)]
+    assert bars == [3, 3, 1, 3, 3], "across the bars of the agents that were told"
+    (upright,) = re.findall(r'<path class="upright" d="([^"]*)"', drawn["Distance to the reference [m]"])
+    assert upright.count("M") == 5
+    above = drawn["From above: north up, east right [m]"]
+    (reference,) = re.findall(r'<path d="([^"]*)" [^>]*stroke-dasharray', above)
+    assert reference.count("M") == 2, "one stretch for each mission"
+
+
+def test_a_run_without_orders_has_one_mission_and_no_marks(shared: Path) -> None:
+    page = (shared / "report.html").read_text()
+    assert ", 3.0 s of mission time. Times count from mission start;" in page
+    assert "upright" not in page.split("</style>")[1]
+
+
+def test_a_run_that_an_earlier_version_recorded_shows_the_modes_of_its_agents(tmp_path: Path) -> None:
+    directory = finish(tmp_path / "old")
+    for agent in range(3):
+        path = directory / f"agent-{agent}.parquet"
+        pq.write_table(pq.read_table(path).drop_columns("control"), path)
+    report([directory])
+    assert legend(figures((directory / "report.html").read_text())["What the agent did"]) == ["IDLE", "TRACKING"]
+
+
+def test_from_above_the_mission_is_told_from_the_way_there_and_all_signs_are_explained(tmp_path: Path) -> None:
+    moving = {"center_ned_m": (2.0, 2.0, -1.0), "radius_m": 0.5, "keep_out_m": 1.5, "vel_ned_m_s": (-0.1, 0.0, 0.0)}
+    directory = finish(tmp_path / "above", goals=True, obstacles=(moving,))
+    above = figures((directory / "report.html").read_text())["From above: north up, east right [m]"]
+    assert legend(above) == [
+        *("reference", "mission", "way out and back", "agent 0", "agent 1", "agent 2"),
+        *("way of an obstacle", "keep-out", "obstacle", "goal", "end"),
+    ]
+    drawing = above.split("<div class=legend>")[0]
+    for agent in range(3):
+        curves = re.findall(rf'<path d="[^"]*" stroke="{css(agent_rgb(agent))}" [^>]*>', drawing)
+        assert ["opacity" in curve for curve in curves if "dasharray" not in curve] == [True, False]
+    assert re.findall(r">(end \d)</text>", drawing) == ["end 0", "end 1", "end 2"]
+    radii = {style: float(r) for style, r in re.findall(r'<circle class="(\w+)" [^>]*r="([\d.]+)"', drawing)}
+    assert radii["keepout"] == pytest.approx(3.0 * radii["obstacle"], rel=0.02)
+
+
+def test_names_of_places_keep_clear_of_each_other() -> None:
+    crowd = [Place(np.array([0.1 * k, 0.0, 0.0]), f"end {k}", "#000", "dot") for k in range(3)]
+    line = Line(x=np.array([-10.0, 10.0]), y=np.array([-3.0, 3.0]), color="#000")
+    drawn = top_view("crowd", [line], [], places=crowd)
+    at = re.findall(r'<text class="tick mark" x="([-\d.]+)" y="([-\d.]+)" [^>]*text-anchor="(\w+)"', drawn)
+    assert len({(anchor, round(float(y) / 13)) for _, y, anchor in at}) == 3
+
+
+def off_px(px: float, py: float, path_px: NDArray[np.float64], path_py: NDArray[np.float64]) -> float:
+    """Return how far a point is from a path (K,)."""
+    along_x, along_y = np.diff(path_px), np.diff(path_py)
+    share = ((px - path_px[:-1]) * along_x + (py - path_py[:-1]) * along_y) / (along_x**2 + along_y**2)
+    share = np.clip(share, 0.0, 1.0)
+    return float(np.hypot(path_px[:-1] + share * along_x - px, path_py[:-1] + share * along_y - py).min())
+
+
+def test_a_long_flight_keeps_its_shape_from_above() -> None:
+    t = np.linspace(0, 18 * 2 * np.pi, 11_000)  # a figure-8, eighteen times
+    px, py = 300 + 200 * np.sin(t), 200 + 100 * np.sin(2 * t)
+    few_px, few_py = shape_of(px, py, 2_500)
+    assert 500 < len(few_px) <= 2_500
+    for k in range(0, len(t), 97):
+        assert off_px(px[k], py[k], few_px, few_py) < 0.21
+    fewer_px, fewer_py = shape_of(px, py, 200)
+    assert len(fewer_px) <= 200
+    gap = np.where(np.abs(t - 20) < 3, np.nan, px)
+    assert np.isnan(shape_of(gap, py, 2_500)[0]).sum() == 1
+    assert np.isnan(fewer_py).sum() == 0
+
+
+def test_accepted_requests_are_one_row_and_refused_ones_are_not() -> None:
+    def event(at_s: float, agent: int, name: str, **fields: object) -> dict[str, object]:
+        return {"utc_us": 0, "t_us": round(at_s * 1e6), "source": f"agent-{agent}", "event": name, **fields}
+
+    def accepted(at_s: float, agent: int, verb: str) -> dict[str, object]:
+        return event(at_s, agent, "command", verb=verb, ok=True, text="result 0")
+
+    asked = [accepted(0.1 * k, k % 2, "rate" if k < 30 else f"param_get P{k}") for k in range(40)]
+    refused = event(4.0, 0, "command", verb="message", ok=False, text="result 2")
+    events = [*asked, refused, accepted(5.0, 1, "arm"), event(6.0, 1, "state", phase="TAKEOFF")]
+    assert [tuple(row) for row in event_rows(events, lambda event: event["t_us"] * 1e-6)] == [
+        ("0.00", "agent-0, agent-1", "command", "40 accepted: rate 30, param_get 10"),
+        ("4.00", "agent-0", "command", "verb=message, ok=False, text=result 2"),
+        ("5.00", "agent-1", "command", "verb=arm, ok=True, text=result 0"),
+        ("6.00", "agent-1", "state", "phase=TAKEOFF"),
+    ]
 
 
 def test_references_are_compared_at_the_same_mission_times() -> None:

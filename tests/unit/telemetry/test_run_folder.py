@@ -19,13 +19,13 @@ from swarmctl.config import Config, dump
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.core.tick_record import COLUMNS
-from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus
+from swarmctl.core.types import ControlMode, FlightMode, Mode, Phase, PlanStatus
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run
-from swarmctl.telemetry.report.charts import thin
+from swarmctl.telemetry.report.thinning import thin
 
 UTC_US = 1_780_000_000_000_000
 
@@ -39,6 +39,7 @@ def flight(agent: int, agents: int, seconds: float) -> tuple[NDArray[np.void], N
     rows["seq"] = np.arange(len(t_s))
     rows["phase"] = np.select([t_s < 1, t_s < 3, t_s < seconds - 1], [Phase.STANDBY, Phase.TAKEOFF, Phase.TRACK], 8)
     rows["mode"] = np.where(rows["phase"] == Phase.TRACK, Mode.TRACKING, Mode.IDLE)
+    rows["control"] = np.where(rows["phase"] == Phase.TRACK, ControlMode.TRACKING, ControlMode.AUTO)
     rows["mission_t_s"] = np.where(rows["phase"] == Phase.TRACK, t_s - 3, np.nan)
     rows["armed"] = true["armed"] = t_s >= 1
     angle = 0.5 * t_s
@@ -143,7 +144,7 @@ def test_parquet_says_unit_meaning_and_version(tmp_path: Path) -> None:
     assert told == {b"unit": b"m", b"description": b"the mission's reference now", b"entity": b"world/reference/{}"}
     assert [field.name for field in schema] == [part for column in COLUMNS for part in column.parts]
     assert all(field.metadata[b"description"] for field in schema)
-    named = {"phase": Phase, "mode": Mode, "flight_mode": FlightMode, "plan_status": PlanStatus}
+    named = {"phase": Phase, "mode": Mode, "flight_mode": FlightMode, "plan_status": PlanStatus, "control": ControlMode}
     for field in schema:
         said = {b"unit", b"description", b"entity"} | ({b"names"} if field.name in named else set())
         assert set(field.metadata) == said
