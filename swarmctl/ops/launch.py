@@ -6,6 +6,7 @@ all processes, sockets and ports that were started here end with this module.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import signal
 import tempfile
@@ -14,6 +15,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import msgspec
 
 from swarmctl import __version__
 from swarmctl.bus.network.joining import join_bus
@@ -175,6 +178,7 @@ class Launcher(Services):
         self._links = part.links
         self.log = EventLog(directory / "launch.events.jsonl", "launch")
         self.children: dict[str, Child] = {}
+        self._announced: RunningLaunch | None = None
 
     def start(self) -> None:
         """Start every process and join the bus; later failures are seen by the supervisor.
@@ -227,7 +231,7 @@ class Launcher(Services):
         agents = [child for name, child in self.children.items() if name.startswith(agent_name(0)[:-1])]
         others = [child for child in self.children.values() if child not in router + agents]
         end_all(agents, agents_grace_s)
-        self.announce("", ending=True)
+        self._announce_end()
         end_all(others, _STOP_S)
         if self.bus is not None:
             self.bus.close()
@@ -250,24 +254,28 @@ class Launcher(Services):
         (command,) = agent_commands(self._config, context, *ends, config_path=config_path)
         return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
-    def announce(self, view: str, *, ending: bool = False) -> None:
-        """Publish this launch to the operator's commands, or that it is ending."""
+    def announce(self, view: str) -> None:
+        """Publish this launch to the operator's commands."""
         context = self.context
         start_s, pid = process_start_s()
-        announce(
-            RunningLaunch(
-                context.run,
-                context.endpoint,
-                pid,
-                start_s,
-                self._config.swarm.agents,
-                str(context.directory),
-                view,
-                context.identity,
-                __version__,
-                ending,
-            )
+        self._announced = RunningLaunch(
+            context.run,
+            context.endpoint,
+            pid,
+            start_s,
+            self._config.swarm.agents,
+            str(context.directory),
+            view,
+            context.identity,
+            __version__,
         )
+        announce(self._announced)
+
+    def _announce_end(self) -> None:
+        """Publish that nobody answers any more; that it can't be, without a descriptor left, stops no ending."""
+        if self._announced is not None:
+            with contextlib.suppress(OSError):
+                announce(msgspec.structs.replace(self._announced, ending=True))
 
     def _spawn(self, command: Command) -> None:
         self.children[command.name] = Child(command, self.context.directory)

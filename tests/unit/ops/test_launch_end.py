@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from pathlib import Path
@@ -94,30 +95,27 @@ def test_a_verb_that_finds_a_launch_in_its_last_moment_says_that_it_is_ending(
         pass
 
 
+def launcher(folder: Path) -> Launcher:
+    ports = ReservedPorts(sockets=(), ports=(), view_port=0)
+    return Launcher(Config(), LaunchOptions(), ports, folder, part=SwarmPart(run="circle-1a", agents=()))
+
+
 def test_a_launch_is_ending_from_the_end_of_its_agents_until_its_report_is_written(
     launch: RunningLaunch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     order: list[str] = []
 
-    def ended(children: list[object], grace_s: float) -> None:
+    def ended(*given: object) -> bool:
         try:
             order.append(find_launch(launch.run_dir).run)
         except StartError as error:
             order.append("ending" if "is ending" in str(error) else str(error))
-
-    def summed_up(*given: object) -> bool:
-        ended([], 0.0)
         return False
 
     monkeypatch.setattr(launching, "end_all", ended)
-    monkeypatch.setattr(launching, "sum_up", summed_up)
-    services = Launcher(
-        Config(),
-        LaunchOptions(),
-        ReservedPorts(sockets=(), ports=(), view_port=0),
-        tmp_path / "run",
-        part=SwarmPart(run="circle-1a", agents=()),
-    )
+    monkeypatch.setattr(launching, "sum_up", ended)
+    services = launcher(tmp_path / "run")
+    services.announce("")
     services.stop(0.0)
     assert judged(Config(), services, LaunchResult()) == 0
     agents, others, router, report = order
@@ -125,3 +123,17 @@ def test_a_launch_is_ending_from_the_end_of_its_agents_until_its_report_is_writt
     assert (others, router, report) == ("ending",) * 3
     with pytest.raises(StartError, match="no launch runs"):
         find_launch(None)
+
+
+def test_an_end_that_can_not_be_announced_is_one_all_the_same(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def no_descriptor(note: RunningLaunch) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    ended: list[object] = []
+    monkeypatch.setattr(launching, "end_all", lambda children, grace_s: ended.append(children))
+    services = launcher(tmp_path)
+    monkeypatch.setattr(launching, "announce", lambda note: None)
+    services.announce("")
+    monkeypatch.setattr(launching, "announce", no_descriptor)
+    services.stop(0.0)
+    assert len(ended) == 3, "agents, others, router"
