@@ -264,7 +264,7 @@ def test_only_who_was_sent_home_is_shown_as_such() -> None:
     for verb, flight in flights.items():
         assert not verb or flight.ask(verb) == ""
         flight.until(Phase.GOTO_LAND)
-    shown = {verb: flight.mission.control_mode(Mode.TRACKING) for verb, flight in flights.items()}
+    shown = {verb: flight.mission.control_mode(Mode.TRACKING).name for verb, flight in flights.items()}
     assert shown == {"": "RETURN", "rtl": "RTL"}
 
 
