@@ -218,7 +218,7 @@ def above_chart(trace: Trace) -> Markup:
     agents = range(trace.pos_ned_m.shape[1])
     lines = [agent_line(i, trace.pos_ned_m[:, i, 1], trace.pos_ned_m[:, i, 0]) for i in agents]
     lines.append(reference_line(trace.ref_pos_ned_m[:, 0, 1], trace.ref_pos_ned_m[:, 0, 0]))
-    ends = [Place(trace.pos_ned_m[-1, i], "", css(agent_rgb(i)), "dot") for i in agents]
+    ends = [Place(end, "", css(agent_rgb(i)), "dot") for i in agents for end in trace.pos_ned_m[-1:, i]]
     return top_view("From above: north up, east right [m]", lines, _balls(trace)[::-1], places=ends)
 
 
