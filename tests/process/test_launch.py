@@ -131,7 +131,7 @@ def ctrl_c_lands_and_sums_up(start: Start) -> None:
     assert launched.end() == 130, launched.text()
     assert launched.landed() == {0: True, 1: True}
     assert launched.summary()["outcome"] == "interrupted"
-    assert "interrupted, summed mean tracking error" in launched.text()
+    assert "interrupted, " in launched.text() and "summed mean tracking error" in launched.text()
 
 
 def a_second_ctrl_c_ends_everything_at_once(start: Start) -> None:
@@ -303,7 +303,7 @@ def test_operator_verbs(
     assert re.search(r"agent-0 accepts, TRACK; flies to -2, 0.5, -9: \d+\.\d m, \d+ s", sent.stdout)
     far = verb("goto", "0", "1000,2,-9")
     assert far.returncode == 4
-    assert re.search(r"agent-0 refuses: 1000, 2, -9 is 10\d\d m away; beyond 500 m say --far", far.stderr)
+    assert re.search(r"agent-0 refuses: 1000, 2, -9 is 10\d\d m away; beyond 500 m say --far", far.stdout)
     assert json.loads(verb("status", "--json").stdout)[0]["control"] == "GOTO"
     buried = verb("goto", "0", "-2,0.5,500")
     assert buried.returncode == 4
