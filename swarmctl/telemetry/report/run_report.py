@@ -21,7 +21,6 @@ from swarmctl.telemetry.report.svg import Figure
 REPORT = "report.html"
 FIGURES = "figures"
 _EVENTS_LISTED = 400
-_GOALS_LISTED = 12  # agents; the others are in summary.json
 
 
 def write_report(
@@ -48,6 +47,7 @@ def write_report(
         several_missions=missions > 1,
         has_moments=bool(charts.moments),
         rows=summary_rows(summary, rules),
+        arrivals=arrival_texts(summary["goals"]),
         seen_from_above=charts.seen_from_above(),
         sections=_sections(charts),
         events=events[:_EVENTS_LISTED],
@@ -155,14 +155,22 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
 
 
 def _goal_rows(goals: Mapping[str, Any] | None) -> Iterator[SummaryRow]:
-    """Yield whether agents have reached their goals, and when; nothing of a mission without goals."""
-    if goals is None:
-        return
-    yield SummaryRow("goals reached", f"{goals['reached']} of {goals['of']}", number=goals["reached"])
-    for row in goals["agents"][:_GOALS_LISTED]:
-        at_s = row["reached_at_s"]
-        said = f"{_figure(row['left_m'], 'm', 2)} away" if at_s is None else f"after {at_s:.1f} s"
-        yield SummaryRow(f"agent {row['id']} at its goal", said, number=at_s)
+    """Yield how many agents have reached their goals; nothing of a mission without goals."""
+    if goals is not None:
+        times_s = [row["reached_at_s"] for row in goals["agents"] if row["reached_at_s"] is not None]
+        note = f"the last after {max(times_s):.1f} s" if times_s else ""
+        yield SummaryRow("goals reached", f"{goals['reached']} of {goals['of']}", number=goals["reached"], note=note)
+
+
+def arrival_texts(goals: Mapping[str, Any] | None) -> dict[int, str]:
+    """Return when each agent has reached its goal, or how far it is from there; empty without goals."""
+    return {} if goals is None else {row["id"]: _arrival_text(row) for row in goals["agents"]}
+
+
+def _arrival_text(row: Mapping[str, Any]) -> str:
+    if row["reached_at_s"] is not None:
+        return f"{row['reached_at_s']:.1f} s"
+    return "never began" if row["left_m"] is None else f"{row['left_m']:.2f} m away"
 
 
 def _least(name: str, value: float | None, limit: float) -> SummaryRow:

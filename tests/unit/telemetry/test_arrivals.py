@@ -16,7 +16,7 @@ from swarmctl.telemetry.evaluation.arrivals import reached_goals
 from swarmctl.telemetry.evaluation.referee import Rules, evaluate
 from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.summary_file import decode_summary
-from swarmctl.telemetry.report.run_report import summary_rows
+from swarmctl.telemetry.report.run_report import arrival_texts, summary_rows
 from tests.unit.telemetry.test_referee import run, ticks, truth
 
 NO_TRUTH = np.zeros(0, TRUTH_DTYPE)
@@ -81,10 +81,9 @@ def test_verdict_report_and_file_say_who_has_not_arrived() -> None:
     first = summary_lines(summary, Path("x"))[0]
     assert "only 1 of 3 goals reached (agent 1 is 8.00 m away, agent 2 never began)" in first
     read = decode_summary(to_json(summary).encode())
-    rows = {row.name: row.value for row in summary_rows(read, rules)}
-    assert rows["goals reached"] == "1 of 3"
-    assert rows["agent 0 at its goal"] == "after 9.4 s"
-    assert rows["agent 1 at its goal"] == "8.00 m away"
+    rows = {row.name: (row.value, row.note) for row in summary_rows(read, rules)}
+    assert rows["goals reached"] == ("1 of 3", "the last after 9.4 s")
+    assert arrival_texts(read["goals"]) == {0: "9.4 s", 1: "8.00 m away", 2: "never began"}
     arrived = evaluate(run({0: ARRIVES}), Rules(agents=1, required_separation_m=0.5, goals_ned_m=(GOAL,)), "completed")
     assert summary_lines(arrived, Path("x"))[0].startswith("completed, 1 of 1 goals reached, the last after 9.4 s, ")
 
