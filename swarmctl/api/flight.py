@@ -22,7 +22,7 @@ from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.errors import ConfigError, MissionError, StartError
 from swarmctl.files import read_file, replace_text
 from swarmctl.ops.mission_file import set_mission
-from swarmctl.ops.operator import LAUNCH_FILE, RunningLaunch, read_statuses, refuse_ending
+from swarmctl.ops.operator import LAUNCH_FILE, RunningLaunch, read_statuses
 from swarmctl.ops.order_delivery import Reply, deliver
 from swarmctl.telemetry.recording.run_files import CONFIG
 from swarmctl.telemetry.recording.run_folder import create_run_folder
@@ -249,9 +249,7 @@ class Swarm:
             time.sleep(_POLL_S)
 
     def _note(self) -> RunningLaunch:
-        note = msgspec.json.decode(read_file(self.folder / LAUNCH_FILE, _MAX_NOTE_BYTES), type=RunningLaunch)
-        refuse_ending(note)
-        return note
+        return msgspec.json.decode(read_file(self.folder / LAUNCH_FILE, _MAX_NOTE_BYTES), type=RunningLaunch)
 
     def _refuse_ended(self, verb: str) -> None:
         if not self.is_flying:
