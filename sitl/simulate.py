@@ -50,11 +50,8 @@ def simulate(config: Config, directory: Path) -> int:
     outcome = "interrupted" if stop.count else "failed" if problems else "completed"
     for log, agent in zip(flight.logs, flight.agents, strict=True):
         if agent is not None:
-            summary = {"sent": agent.sent, "rejected": agent.rejected, "lost": 0}
-            log.event("bus_summary", log.clock.now_us(), log.clock.utc_us(), **summary)
-            log.event("link_summary", log.clock.now_us(), log.clock.utc_us(), refused=agent.refused_frames)
-            if agent.own_controller:
-                log.event("controller_summary", log.clock.now_us(), log.clock.utc_us(), **agent.own_controller)
+            for name, fields in agent.totals(lost=0).items():
+                log.event(name, log.clock.now_us(), log.clock.utc_us(), **fields)
     speed_factor = flight.clock.now_us() * 1e-6 / wall_s
     shown = () if stop.count else tuple(problems)
     unwritten = _write_rows(flight, directory)

@@ -8,7 +8,7 @@ import numpy as np
 
 from swarmctl.config import Config
 from swarmctl.control.reference.kinds.csv_table import CsvParams
-from swarmctl.core.types import Array
+from swarmctl.core.text import point_text
 
 _BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
 _AGENTS_SHOWN = 3
@@ -40,14 +40,10 @@ def _begin_elsewhere(config: Config) -> Iterator[str]:
         begin = reference.sample(_ZERO)[0][0]
         away_m = float(np.linalg.norm(begin - start))
         if reference.fixed_in_time and not reference.jumps and away_m > _BEGINS_M:
-            places = f"{_words(begin)}, start {_words(start)}"
+            places = f"{point_text(begin.round(2))}, start {point_text(start.round(2))}"
             found.append(f"agent {agent}: the reference begins {away_m:.2f} m from its start (at {places})")
     added = config.mission.kind == "csv" and config.mission.section(CsvParams).from_start
     hint = "; mission.csv.from_start adds positions to the start: begin at 0, 0, 0" if added else ""
     yield from (f"{text}{hint}" for text in found[:_AGENTS_SHOWN])
     if len(found) > _AGENTS_SHOWN:
         yield f"{len(found) - _AGENTS_SHOWN} more references begin away from the agents' starts"
-
-
-def _words(place: Array) -> str:
-    return ", ".join(f"{part:g}" for part in np.round(place, 2).tolist())

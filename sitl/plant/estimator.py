@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,13 +76,15 @@ class ErrorModel:
     @property
     def wander(self) -> Array:
         """RMS and correlation time [s] of what wanders, (2, 8): position, velocity, tilt; (2, 14) with fast ones."""
-        rows = [*zip(self.position_m, (self.position_tau_s,) * 3, strict=True)]
-        rows += zip(self.velocity_m_s, (self.velocity_tau_s,) * 3, strict=True)
-        rows += [(self.tilt_rad, self.tilt_tau_s)] * 2
+        groups: list[tuple[tuple[float, ...], float]] = [
+            (self.position_m, self.position_tau_s),
+            (self.velocity_m_s, self.velocity_tau_s),
+            ((self.tilt_rad,) * 2, self.tilt_tau_s),
+        ]
         if any((*self.fast_position_m, *self.fast_velocity_m_s)):
-            rows += zip(self.fast_position_m, (self.fast_position_tau_s,) * 3, strict=True)
-            rows += zip(self.fast_velocity_m_s, (self.fast_velocity_tau_s,) * 3, strict=True)
-        return np.array(rows).T
+            groups.append((self.fast_position_m, self.fast_position_tau_s))
+            groups.append((self.fast_velocity_m_s, self.fast_velocity_tau_s))
+        return np.array([(rms, tau_s) for errors, tau_s in groups for rms in errors]).T
 
     @property
     def accuracy_m(self) -> tuple[float, float]:
@@ -104,63 +107,41 @@ _PERFECT = ErrorModel(
     latency_s=(0.0, 0.0),
 )  # carries faults only
 
+_INERTIAL = partial(
+    ErrorModel,
+    tilt_rad=math.radians(0.3),
+    tilt_tau_s=20.0,
+    noise_attitude_rad=math.radians(0.1),
+    latency_s=(0.010, 0.020),
+)
+_SLOW = partial(_INERTIAL, position_tau_s=25.0, velocity_tau_s=4.0, noise_position_m=0.005, noise_velocity_m_s=0.02)
+_FITTED = partial(_INERTIAL, position_tau_s=10.0, velocity_tau_s=5.0, noise_position_m=0.0012, noise_velocity_m_s=0.006)
+
 ESTIMATORS: dict[str, ErrorModel | None] = {
     "exact": None,
-    "gps": ErrorModel(  # slow errors of PX4 with its default GPS: position 0.3-0.6 m off in space, velocity 0.1-0.3 m/s
+    "gps": _SLOW(  # slow errors of PX4 with its default GPS: position 0.3-0.6 m off in space, velocity 0.1-0.3 m/s
         position_m=(0.2, 0.2, 0.25),
-        position_tau_s=25.0,
         velocity_m_s=(0.15, 0.15, 0.15),
-        velocity_tau_s=4.0,
-        tilt_rad=math.radians(0.3),
-        tilt_tau_s=20.0,
-        noise_position_m=0.005,
-        noise_velocity_m_s=0.02,
-        noise_attitude_rad=math.radians(0.1),
-        latency_s=(0.010, 0.020),
     ),
-    "external": ErrorModel(  # position fed from outside into the same filter: 4 cm off in space, velocity 0.05-0.1 m/s
+    "external": _SLOW(  # position fed from outside into the same filter: 4 cm off in space, velocity 0.05-0.1 m/s
         position_m=(0.023, 0.023, 0.023),
-        position_tau_s=25.0,
         velocity_m_s=(0.055, 0.055, 0.055),
-        velocity_tau_s=4.0,
-        tilt_rad=math.radians(0.3),
-        tilt_tau_s=20.0,
-        noise_position_m=0.005,
-        noise_velocity_m_s=0.02,
-        noise_attitude_rad=math.radians(0.1),
-        latency_s=(0.010, 0.020),
     ),
-    "px4_gps": ErrorModel(  # slow and fast, fitted to logs of PX4 1.18 beside the truth of its simulator
+    "px4_gps": _FITTED(  # slow and fast, fitted to logs of PX4 1.18 beside the truth of its simulator
         position_m=(0.12, 0.25, 0.3),
-        position_tau_s=10.0,
         velocity_m_s=(0.14, 0.3, 0.14),
-        velocity_tau_s=5.0,
         fast_position_m=(0.03, 0.03, 0.02),
         fast_position_tau_s=1.2,
         fast_velocity_m_s=(0.03, 0.07, 0.045),
         fast_velocity_tau_s=0.5,
-        tilt_rad=math.radians(0.3),
-        tilt_tau_s=20.0,
-        noise_position_m=0.0012,
-        noise_velocity_m_s=0.006,
-        noise_attitude_rad=math.radians(0.1),
-        latency_s=(0.010, 0.020),
     ),
-    "px4_external": ErrorModel(  # the same, position fed at 50 Hz into a PX4 set up for it: 2 cm off
+    "px4_external": _FITTED(  # the same, position fed at 50 Hz into a PX4 set up for it: 2 cm off
         position_m=(0.006, 0.015, 0.005),
-        position_tau_s=10.0,
         velocity_m_s=(0.03, 0.03, 0.012),
-        velocity_tau_s=5.0,
         fast_position_m=(0.005, 0.014, 0.011),
         fast_position_tau_s=0.5,
         fast_velocity_m_s=(0.025, 0.085, 0.055),
         fast_velocity_tau_s=0.5,
-        tilt_rad=math.radians(0.3),
-        tilt_tau_s=20.0,
-        noise_position_m=0.0012,
-        noise_velocity_m_s=0.006,
-        noise_attitude_rad=math.radians(0.1),
-        latency_s=(0.010, 0.020),
     ),
 }
 

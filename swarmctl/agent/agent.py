@@ -154,6 +154,12 @@ class Agent:
         """Name of an own controller, and how many ticks of missions it has flown; empty for a built-in one."""
         return self._controller_watch.summary
 
+    def totals(self, lost: int) -> dict[str, dict[str, Any]]:
+        """Return the events that sum up a flight, fields by name; `lost` records are in no file."""
+        bus = {"sent": self.sent, "rejected": self.rejected, "lost": lost}
+        found: dict[str, dict[str, Any]] = {"bus_summary": bus, "link_summary": {"refused": self.refused_frames}}
+        return found | ({"controller_summary": self.own_controller} if self.own_controller else {})
+
     @property
     def commits_refused(self) -> int | None:
         """Number of proposals withdrawn or expired; None if separation works without proposals."""

@@ -158,11 +158,8 @@ def _fly(
         sessions = SessionWatch(link, lambda name, **f: recorder.event(name, clock.now_us(), clock.utc_us(), **f))
         return _loop(flown, config, clock, stop, sessions, vehicle=vehicle, only_land=process.only_land)
     finally:
-        summary = {"sent": flown.sent, "rejected": flown.rejected, "lost": recorder.lost}
-        recorder.event("bus_summary", clock.now_us(), clock.utc_us(), **summary)
-        recorder.event("link_summary", clock.now_us(), clock.utc_us(), refused=flown.refused_frames)
-        if flown.own_controller:
-            recorder.event("controller_summary", clock.now_us(), clock.utc_us(), **flown.own_controller)
+        for name, fields in flown.totals(recorder.lost).items():
+            recorder.event(name, clock.now_us(), clock.utc_us(), **fields)
         link.close()
         transport.close()
         recorder.close()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 MOST_SHOWN = 500
 
@@ -15,6 +15,11 @@ def printable(text: str, most: int = MOST_SHOWN) -> str:
     half = most // 2
     short = text if len(text) <= most else f"{text[:half]} ... {text[-half:]}"
     return "".join(c if c.isprintable() else _escaped(c) for c in short)
+
+
+def point_text(point: Iterable[float]) -> str:
+    """Return the numbers of a point as an operator writes them: "5, -2, -3"."""
+    return ", ".join(f"{part:g}" for part in point)
 
 
 def told_apart(values: Sequence[str], most: int) -> list[str]:

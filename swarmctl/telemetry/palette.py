@@ -59,20 +59,16 @@ MODE_RGB = {
 }
 
 CONTROL_RGB = {
-    "AUTO": (71, 85, 105),
-    "PRIMING": (14, 165, 233),
-    "TRACKING": (34, 160, 90),
-    "REPLAY": (234, 179, 8),
-    "BRAKE": (249, 115, 22),
-    "HOLD": (45, 212, 191),
+    **{name: MODE_RGB[name] for name in ("PRIMING", "TRACKING", "REPLAY", "BRAKE", "HOLD")},
+    "AUTO": MODE_RGB["IDLE"],
     "GOTO": (236, 72, 153),
     "WAIT": (202, 138, 4),
     "RETURN": (163, 230, 53),
     "RTL": (129, 140, 248),
-    "LANDING": (99, 102, 241),
-    "PILOT": (168, 85, 247),
+    "LANDING": MODE_RGB["LAND"],
+    "PILOT": MODE_RGB["PILOT_OVERRIDE"],
     "FAILSAFE": (190, 18, 60),
-    "LOST": (220, 38, 38),
+    "LOST": MODE_RGB["STATE_STALE"],
 }
 
 PLAN_RGB = {

@@ -131,7 +131,7 @@ def ctrl_c_lands_and_sums_up(start: Start) -> None:
     assert launched.end() == 130, launched.text()
     assert launched.landed() == {0: True, 1: True}
     assert launched.summary()["outcome"] == "interrupted"
-    assert "interrupted, " in launched.text() and "summed mean tracking error" in launched.text()
+    assert re.search(r"interrupted, (only )?\d of 2 goals reached.*, summed mean tracking error", launched.text())
 
 
 def a_second_ctrl_c_ends_everything_at_once(start: Start) -> None:

@@ -38,11 +38,10 @@ class StartConditions:
 
     def report(self, now_us: int) -> None:
         """Raise the unmet condition as an alert once the agent has waited for a while; clear it once it is met."""
-        waits_for = self._mission.waits_for
-        if self._mission.phase not in (Phase.STANDBY, Phase.READY):
+        waits_for, may_wait = self._mission.waits_for, self._mission.phase in (Phase.STANDBY, Phase.READY)
+        if not may_wait:
             self._waits_since_us = now_us
-            self._alerts.clear("start")
-        elif not waits_for:
+        if not (may_wait and waits_for):
             self._alerts.clear("start")
         elif now_us - self._waits_since_us > _START_ALERT_DELAY_US:
             self._alerts.put("start", f"waits for {waits_for}", now_us)

@@ -10,6 +10,7 @@ import numpy as np
 from swarmctl.control.phases.interruptions import HoldPoint
 from swarmctl.control.phases.mission_state import SPIN_UP_US, MissionState
 from swarmctl.core.operator_verbs import BEGIN, GOTO, MISSION, POINT, SPEED, YAW, Order
+from swarmctl.core.text import point_text
 from swarmctl.core.types import Landed, Phase, VehicleState
 
 _MINUTES = 3.0  # a longer flight is told in minutes
@@ -55,10 +56,9 @@ def outcome_of(order: Order, mission: MissionState) -> str:
     if order.verb != GOTO or begun is None:
         return ""
     way = begun.trajectory
-    place = ", ".join(f"{part:g}" for part in way.to_ned_m.tolist())
     away_m, minutes = math.dist(way.from_ned_m, way.to_ned_m), way.travel_s / 60.0
     takes = f"{minutes:.0f} min" if minutes > _MINUTES else f"{way.travel_s:.0f} s"
-    return f"flies to {place}: {away_m:.{0 if away_m > _WHOLE_M else 1}f} m, {takes}"
+    return f"flies to {point_text(way.to_ned_m)}: {away_m:.{0 if away_m > _WHOLE_M else 1}f} m, {takes}"
 
 
 def _change_mission(mission: MissionState, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.operator_verbs import FAR, FAR_M, GOTO, OPERATOR_VERBS, POINT, Order
+from swarmctl.core.text import point_text
 from swarmctl.core.types import Landed, Phase, VehicleState
 
 Contains = Callable[[tuple[float, float]], bool]  # whether north and east [m] lie within the geofence
@@ -72,7 +73,7 @@ def _goto_refusal(order: Order, state: VehicleState, situation: OrderSituation) 
         return f"down {target[2]:g} m is too low: {situation.lowest_m:.2f} at most"
     away_m = math.dist(state.pos_ned_m, target)
     if away_m > FAR_M and not order.arguments.get(FAR):
-        return f"{', '.join(f'{part:g}' for part in target)} is {away_m:.0f} m away; beyond {FAR_M:g} m say --far"
+        return f"{point_text(target)} is {away_m:.0f} m away; beyond {FAR_M:g} m say --far"
     if situation.volume is not None and (refusal := situation.volume.refusal(target)):
         return refusal
     points = min(_MOST_WAY_POINTS, 2 + int(math.dist(state.pos_ned_m[:2], target[:2]) / _WAY_STEP_M))

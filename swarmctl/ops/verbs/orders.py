@@ -14,7 +14,6 @@ import typer
 
 from swarmctl.core.operator_verbs import (
     FAR,
-    FAR_M,
     GOTO,
     MISSION,
     OPERATOR_VERBS,
@@ -58,7 +57,16 @@ def _option(argument: VerbArgument) -> Any:
 
 
 def _option_of(verb: str, name: str) -> Any:
-    return _option(next(argument for argument in OPERATOR_VERBS[verb].arguments if argument.name == name))
+    return _option(_argument_of(verb, name))
+
+
+def _flag_of(verb: str, name: str) -> Any:
+    argument = _argument_of(verb, name)
+    return typer.Option(argument.option, help=argument.help)
+
+
+def _argument_of(verb: str, name: str) -> VerbArgument:
+    return next(argument for argument in OPERATOR_VERBS[verb].arguments if argument.name == name)
 
 
 def _give(order: Order, run: str | None, agents: list[int], as_json: bool) -> int:
@@ -127,7 +135,7 @@ def _goto(
     point: Annotated[str, typer.Argument(metavar="N,E,D", help="Point, shared NED [m]; up is negative.")],
     yaw: Annotated[float | None, _option_of(GOTO, YAW)] = None,
     speed: Annotated[float | None, _option_of(GOTO, SPEED)] = None,
-    far: Annotated[bool, typer.Option("--far", help=f"Fly there though it is more than {FAR_M:g} m away.")] = False,
+    far: Annotated[bool, _flag_of(GOTO, FAR)] = False,
     run: Run = None,
     as_json: AsJson = False,
 ) -> int:
@@ -135,9 +143,8 @@ def _goto(
 
     problems: list[str] = []
     arguments = dict(zip(POINT, operator.vector("N,E,D", point, problems), strict=True))
-    arguments |= {name: value for name, value in ((YAW, yaw), (SPEED, speed)) if value is not None}
-    if far:
-        arguments[FAR] = 1.0
+    chosen = ((YAW, yaw), (SPEED, speed), (FAR, 1.0 if far else None))
+    arguments |= {name: value for name, value in chosen if value is not None}
     if problem := "".join(problems) or order_problem(GOTO, arguments):
         raise ConfigError(GOTO, [problem])
     return _give(Order(GOTO, arguments), run, [agent], as_json)

@@ -18,16 +18,8 @@ _TALLEST_PX = 420.0
 _POINTS = 7_000  # of all lines together: less than 100 kB
 _FEWEST, _MOST = 100, 2_500  # of one line
 _ROW_PX = 13.0  # height of a label
-_BESIDE_PX = (
-    (9, -9),
-    (9, 10),
-    (-9, -9),
-    (-9, 10),
-    (0, -17),
-    (0, 18),
-    (9, -22),
-    (-9, 23),
-)  # where it may be, best first
+# Where a label may be, from its place: best first.
+_BESIDE_PX = ((9, -9), (9, 10), (-9, -9), (-9, 10), (0, -17), (0, 18), (9, -22), (-9, 23))
 _BALLS = {"keepout": "keep-out", "obstacle": "obstacle"}
 _PLACES = {"ring": "goal", "dot": "end"}
 

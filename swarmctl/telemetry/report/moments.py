@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.operator_verbs import EXCLUDE, GOTO, MISSION, POINT
+from swarmctl.core.text import point_text
 from swarmctl.core.types import Array
 from swarmctl.telemetry.evaluation.tracks import missions
 
@@ -65,7 +66,7 @@ def _words(event: Mapping[str, Any]) -> str:
     """Return an order in words; "" for what changes no flight."""
     verb = str(event.get("verb"))
     if verb == GOTO:
-        return f"goto {', '.join(f'{float(event.get(axis, np.nan)):g}' for axis in POINT)}"
+        return f"goto {point_text(float(event.get(axis, np.nan)) for axis in POINT)}"
     return {EXCLUDE: "", MISSION: "mission set"}.get(verb, verb)
 
 

@@ -206,12 +206,8 @@ def flood(port: int, stop: Event, rate_hz: Any) -> None:
     rate_hz.value = count / (time.monotonic() - began)
 
 
-def fly_through_flood(link: UdpTransport, port: int, seconds: float) -> tuple[float, int, int, float]:
-    """Time of a tick's draining [ms], frames of the vehicle sent and heard, and the flood's rate [1/s].
-
-    Nineteen ticks in twenty take no longer. The kernel takes in some of the flood on whatever thread is running, and
-    counts it as that thread's time.
-    """
+def fly_through_flood(link: UdpTransport, port: int, seconds: float) -> tuple[list[float], int, int, float]:
+    """Times of the ticks' draining [ms], frames of the vehicle sent and heard, and the flood's rate [1/s]."""
     stop, rate_hz = multiprocessing.Event(), multiprocessing.Value("d", 0.0)
     flooder = multiprocessing.Process(target=flood, args=(port, stop, rate_hz), daemon=True)
     vehicle = speaker()
@@ -230,16 +226,17 @@ def fly_through_flood(link: UdpTransport, port: int, seconds: float) -> tuple[fl
     stop.set()
     flooder.join(5.0)
     vehicle.close()
-    return float(np.percentile(duration_ms, 95)), sent, got, float(rate_hz.value)
+    return duration_ms, sent, got, float(rate_hz.value)
 
 
 def test_a_flood_costs_the_tick_nothing_and_loses_nothing_of_the_vehicle(port: socket.socket) -> None:
     link = UdpTransport(port, None, heartbeat_of(SYSID))
-    drain_ms, sent, got, rate_hz = fly_through_flood(link, port.getsockname()[1], 2.0)
-    print(f"flood {rate_hz:.0f}/s: drain {drain_ms:.2f} ms, {got} of {sent} frames")
+    duration_ms, sent, got, rate_hz = fly_through_flood(link, port.getsockname()[1], 2.0)
+    worst_ms = max(duration_ms)
+    print(f"flood {rate_hz:.0f}/s: worst drain {worst_ms:.2f} ms, {got} of {sent} frames")
     assert rate_hz > 20_000
     assert got == sent
-    assert drain_ms < 5.0
+    assert worst_ms < 5.0
 
 
 def test_negative_control_without_the_kernels_help_the_drain_is_bounded_but_frames_are_lost(
@@ -247,7 +244,8 @@ def test_negative_control_without_the_kernels_help_the_drain_is_bounded_but_fram
 ) -> None:
     monkeypatch.setattr(transport, "admit_only", lambda *_, **__: None)
     link = UdpTransport(port, None, heartbeat_of(SYSID))
-    drain_ms, sent, got, rate_hz = fly_through_flood(link, port.getsockname()[1], 2.0)
+    duration_ms, sent, got, rate_hz = fly_through_flood(link, port.getsockname()[1], 2.0)
+    drain_ms = float(np.percentile(duration_ms, 95))  # a thread is also charged for packets that the kernel takes in
     print(f"flood {rate_hz:.0f}/s: drain {drain_ms:.2f} ms, {got} of {sent} frames")
     assert got < sent
     assert drain_ms < 8.0
