@@ -57,6 +57,7 @@ class VehicleSetup:
         self._compared = False  # read values have been compared with wanted ones
         self._before: dict[str, Command] = {}  # parameter -> command that restores its original value
         self._restoring = False
+        self._restore_from_us = 0
         self._open: Command | None = None
         self._failed: dict[str, str] = {}  # parameter -> answer of the autopilot
         self._origin_us = 0
@@ -84,10 +85,11 @@ class VehicleSetup:
         """Parameters that could not be restored, with their original values."""
         return {name: set_back.value or float(set_back.number) for name, set_back in self._before.items()}
 
-    def restore(self) -> None:
-        """Begin to restore every changed parameter; the vehicle is disarmed or has been handed back."""
+    def restore(self, now_us: int) -> None:
+        """Begin to restore every changed parameter; the vehicle has just been heard disarmed, or is handed back."""
         self._todo = deque(reversed(self._before.values()))
         self._restoring = True
+        self._restore_from_us = now_us + (round(1e6 * self._dialect.saving_s) if self._dialect else 0)
 
     def on_result(self, result: CommandResult) -> None:
         """Take a result of the command port, whichever part requested it."""
@@ -108,6 +110,8 @@ class VehicleSetup:
         self._open = None
         if self._restoring:
             self.restored = not self._todo
+            if now_us < self._restore_from_us:
+                return
         elif self.ready:
             self._watch(now_us)
         elif not self._todo:

@@ -7,7 +7,7 @@ from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
-_RESTORE_TIMEOUT_US = 5_000_000  # longest wait for parameters to be restored before the process ends
+_RESTORE_TIMEOUT_US = 6_000_000  # longest wait for parameters to be restored before the process ends
 
 
 class MissionEnd:
@@ -38,7 +38,7 @@ class MissionEnd:
             return
         if self._ended_us is None:
             self._ended_us = now_us
-            self._vehicle_setup.restore()
+            self._vehicle_setup.restore(now_us)
         left = self._vehicle_setup.left_changed
         if left and self.done and self._alerts.put("restore", f"parameters left changed, they were: {left}", now_us):
             self._ports.note("parameters_left_changed", were=left)

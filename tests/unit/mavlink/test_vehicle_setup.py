@@ -225,17 +225,29 @@ def test_after_the_flight_parameters_are_what_they_were(
     vehicle = Vehicle(autopilot, **came_with).set_up(**wanted).run(30.0)
     assert wanted.items() <= vehicle.params.items()
     assert not vehicle.vehicle_setup.restored
-    vehicle.vehicle_setup.restore()
+    vehicle.vehicle_setup.restore(vehicle.clock.now_us())
     vehicle.run(3.0)
     assert vehicle.vehicle_setup.restored
     assert came_with.items() <= vehicle.params.items()
     assert vehicle.vehicle_setup.left_changed == {}
 
 
+def test_px4_is_left_alone_while_it_may_be_saving_its_parameters_after_a_disarm() -> None:
+    vehicle = Vehicle(NAV_DLL_ACT=0).set_up(NAV_DLL_ACT=3).run(4.0)
+    vehicle.vehicle_setup.restore(vehicle.clock.now_us())
+    vehicle.run(0.95)
+    assert (vehicle.params["NAV_DLL_ACT"], vehicle.vehicle_setup.restored) == (3, False)
+    vehicle.run(0.5)
+    assert (vehicle.params["NAV_DLL_ACT"], vehicle.vehicle_setup.restored) == (0, True)
+    unchanged = Vehicle().set_up().run(4.0)
+    unchanged.vehicle_setup.restore(unchanged.clock.now_us())
+    assert unchanged.run(0.1).vehicle_setup.restored  # nothing to restore: nothing to wait for
+
+
 def test_a_parameter_that_could_not_be_set_back_is_named_with_its_value() -> None:
     vehicle = Vehicle(NAV_DLL_ACT=0).set_up(NAV_DLL_ACT=3).run(4.0)
     vehicle.read_only = True
-    vehicle.vehicle_setup.restore()
+    vehicle.vehicle_setup.restore(vehicle.clock.now_us())
     vehicle.run(3.0)
     assert (vehicle.vehicle_setup.restored, vehicle.vehicle_setup.left_changed) == (True, {"NAV_DLL_ACT": 0})
 
