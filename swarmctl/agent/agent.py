@@ -315,7 +315,7 @@ class Agent:
 
     def _phase_inputs(self, now_us: int, state: VehicleState | None) -> PhaseInputs:
         autopilot, directive, phase = self._ports.autopilot, self._planner.directive, self._mission.phase
-        utc_us = self._ports.clock.utc_us()
+        utc_us = self._ports.utc_of_us(now_us)
         return PhaseInputs(
             now_us=now_us,
             utc_us=utc_us,

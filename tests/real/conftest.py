@@ -77,11 +77,11 @@ def field(network: Network, tmp_path: Path, tmp_path_factory: pytest.TempPathFac
         count: int,
         parameters: dict[str, float] | None = None,
         on_truth: Callable[[Witness, int, Truth], None] | None = None,
-        is_accuracy_judged: bool = False,
+        is_alone: bool = False,
     ) -> Field:
         require(kind, network, count)
         if count >= FLEET:
-            turns.enter_context(turn(tmp_path_factory.getbasetemp().parent, is_accuracy_judged))
+            turns.enter_context(turn(tmp_path_factory.getbasetemp().parent, is_alone))
         fleet = Fleet(kind, count, network, tmp_path / "vehicles", parameters)
         fields.append(Field(fleet, Witness(fleet, on_truth), tmp_path))
         return fields[-1]
@@ -93,16 +93,16 @@ def field(network: Network, tmp_path: Path, tmp_path_factory: pytest.TempPathFac
 
 
 @contextlib.contextmanager
-def turn(shared: Path, is_accuracy_judged: bool) -> Iterator[None]:
+def turn(shared: Path, is_alone: bool) -> Iterator[None]:
     """Wait until fewer fleets are in the air than this machine has processors: lanes share that folder.
 
-    A fleet whose accuracy is judged waits until there is no other: two of them, each with its agents, take turns of
-    the processors, and what is measured then is how late their ticks are.
+    A fleet that has to fly accurately or without overload waits until there is no other: two of them, each with its
+    agents, take turns of the processors, and what is measured then is how late their ticks are.
     """
     with contextlib.ExitStack() as stack:
         names = [shared / f"fleet-{i}.lock" for i in range(len(os.sched_getaffinity(0)))]
         files = [stack.enter_context(name.open("w")) for name in names]
-        wanted = [[file] for file in files] if is_accuracy_judged else [files]  # each of them, or any one
+        wanted = [[file] for file in files] if is_alone else [files]  # each of them, or any one
         for choice in wanted:
             while not any(locked(file) for file in choice):
                 time.sleep(LOOK_S)

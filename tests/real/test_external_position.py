@@ -51,7 +51,7 @@ def feed(witness: Witness, index: int, truth: Truth) -> None:
 
 @pytest.mark.parametrize("time_number", [1, 2])
 def test_three_px4_with_external_position_fly_close_together(field: Fielder, time_number: int) -> None:
-    here = field(PX4, 3, FED, feed, is_accuracy_judged=True)
+    here = field(PX4, 3, FED, feed, is_alone=True)
     summary = flown(here, PX4_CONFIG, *CLOSE).summary()
     assert summary["violations"] == []
     assert summary["tracking"]["index_after_10s_m"] <= 1.75
@@ -61,7 +61,7 @@ def test_three_px4_with_external_position_fly_close_together(field: Fielder, tim
 
 @pytest.mark.parametrize("time_number", [1, 2])
 def test_three_px4_fly_close_together_by_commitments(field: Fielder, time_number: int) -> None:
-    here = field(PX4, 3, FED, feed, is_accuracy_judged=True)
+    here = field(PX4, 3, FED, feed, is_alone=True)
     summary = flown(here, PX4_CONFIG, *CLOSE, "--set", "separation.mode=guaranteed").summary()
     assert summary["violations"] == [], "0.85 m by estimate among them"
     assert summary["tracking"]["index_after_10s_m"] <= 1.25 * INDEX_M

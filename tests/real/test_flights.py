@@ -55,7 +55,7 @@ def test_a_lone_px4_tracks_its_circle(field: Fielder) -> None:
 
 @pytest.mark.parametrize("after_boot_s", [0, 2, 5, 20])
 def test_three_px4_fly_twice_as_they_are_however_early_they_are_launched(field: Fielder, after_boot_s: float) -> None:
-    here = field(PX4, 3)
+    here = field(PX4, 3, is_alone=True)
     time.sleep(after_boot_s)
     for _ in range(2):
         launched = flown(here, PX4_CONFIG, "--duration", "12")
@@ -64,7 +64,7 @@ def test_three_px4_fly_twice_as_they_are_however_early_they_are_launched(field: 
 
 
 def test_three_px4_fly_the_built_in_mission(field: Fielder) -> None:
-    here = field(PX4, 3)
+    here = field(PX4, 3, is_alone=True)
     launched = flown(here, PX4_CONFIG)
     assert launched.summary()["violations"] == []
     assert here.witness.min_separation_m() > BODIES_M
@@ -72,7 +72,7 @@ def test_three_px4_fly_the_built_in_mission(field: Fielder) -> None:
 
 def booted(field: Fielder, count: int) -> Field:
     """ArduCopters with a position, in real time."""
-    here = field(ARDUCOPTER, count, is_accuracy_judged=True)
+    here = field(ARDUCOPTER, count, is_alone=True)
     here.witness.wait(here.witness.all_placed, PLACED_S, "a position")
     for index in range(count):
         here.witness.set_parameter(index, "SIM_SPEEDUP", 1.0)

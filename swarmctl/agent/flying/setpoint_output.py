@@ -75,7 +75,7 @@ class SetpointOutput:
             flies=flies,
             committed_peers=committed_peers,
         )
-        yaw_rad = self._heading.at(now_us, self._references.heading_rad(self._ports.clock.utc_us()))
+        yaw_rad = self._heading.at(now_us, self._references.heading_rad(self._ports.utc_of_us(now_us)))
         setpoint = setpoint_of(virtual_control, yaw_rad, estimate.hover_thrust_01, now_us, params=self._model)
         if refused := self._ports.autopilot.send(setpoint, self._ports.clock.now_us()):
             self._alerts.put("setpoint", f"setpoint refused: {refused}", now_us)

@@ -64,7 +64,7 @@ class Planner:
         transit: Controller,
         alerts: Alerts,
     ) -> None:
-        self._clock, self._utc_of_us, self._alerts = ports.clock, ports.utc_of_us, alerts
+        self._utc_of_us, self._alerts = ports.utc_of_us, alerts
         self._world_model, self._own_state, self._mission = world_model, own_state, mission
         self._references, self._separation, self._modes = references, separation, modes
         self.controller, self._transit = controller, transit
@@ -78,7 +78,7 @@ class Planner:
         """Return what is planned in this tick; nothing from a stale state, and no plan while the autopilot flies."""
         if state is None or not self._modes.is_fresh(now_us, state):
             # the autopilot flies the vehicle, on stale setpoints or by its failsafe
-            self.directive = self._separation.wait(self._clock.utc_us(), state)
+            self.directive = self._separation.wait(self._utc_of_us(now_us), state)
             return PlanningResult(start=None, plan=None, reference=None, keep_outs=[])
         mission = self._mission
         start = self._own_state.start(state, now_us + self._own_state.delay_us, controls=mission.had_control)
@@ -87,7 +87,7 @@ class Planner:
         controls = flies and mission.had_control
         if outside := self._volume_watch.update(now_us, state, controls):
             self._alerts.put("volume", outside, now_us)
-        self._references.look_ahead(now_us, self._clock.utc_us())
+        self._references.look_ahead(now_us, self._utc_of_us(now_us))
         self._detect_deadlock(now_us, state, keep_outs, controls)
         reference, now_ref = self._references.reference()
         self.directive = self._separate(now_us, state, keep_outs, controls)
@@ -115,13 +115,13 @@ class Planner:
             return
         known = (*keep_outs, *self.directive.lost_peer_keep_outs)
         landmarks = self._world_model.landmarks
-        deadlock = self._references.update(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks=landmarks)
+        deadlock = self._references.update(now_us, self._utc_of_us(now_us), state.pos_ned_m, known, landmarks=landmarks)
         if deadlock is not None:
             self._alerts.put("deadlock", f"deadlocked by {deadlock.names}", now_us)
 
     def _separate(self, now_us: int, state: VehicleState, keep_outs: KeepOuts, controls: bool) -> SeparationDirective:
         """Return this tick's directive; its reference begins where the setpoint acts."""
-        utc_us = self._clock.utc_us()
+        utc_us = self._utc_of_us(now_us)  # of the tick: a tick can be held up before this line
         if not controls or self._modes.mode in _DEVIATING_MODES:
             return self._separation.idle(utc_us, state, keep_outs)
         return self._separation.step(

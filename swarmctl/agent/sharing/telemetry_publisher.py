@@ -72,8 +72,10 @@ class TelemetryPublisher:
     ) -> TickRecord:
         """Return the record of one tick; the setpoint has been sent before."""
         self.seq += 1
-        utc_us, battery_01 = self._clock.utc_us(), self._autopilot.health.battery_01
-        peers, obstacles, age_ms = self._distances(planning, utc_us)
+        # a tick can be held up for 30 ms in its middle: the state's time in UTC is that of its beginning
+        utc_us = self._clock.utc_us() + now_us - self._clock.now_us()
+        battery_01 = self._autopilot.health.battery_01
+        peers, obstacles, age_ms = self._distances(planning, utc_us - now_us)
         return TickRecord(
             t_us=now_us,
             utc_us=utc_us,
@@ -125,14 +127,15 @@ class TelemetryPublisher:
         )
         self._bus.publish(topics.ANSWER, encode_message(message))
 
-    def _distances(self, planning: PlanningResult, utc_us: int) -> tuple[list[float], list[float], float]:
+    def _distances(self, planning: PlanningResult, offset_us: int) -> tuple[list[float], list[float], float]:
         """Return distances to peers and visible obstacles [m] when the setpoint acts, and the largest staleness [ms].
 
         A path begins when its sender's setpoint acts, so its staleness counts from there to when our setpoint acts.
+        `offset_us` is UTC minus monotonic time.
         """
         if planning.start is None:
             return [], [], math.nan
-        start, act_utc_us = planning.start, utc_us + planning.start.t_us - self._clock.now_us()
+        start, act_utc_us = planning.start, planning.start.t_us + offset_us
         here = start.pos_ned_m.tolist()
         peers = [math.dist(here, k.pos_ned_m[0].tolist()) for k in planning.keep_outs if k.priority_id >= 0]
         obstacles = [k.distance_m(start.pos_ned_m) for k in planning.keep_outs if k.priority_id < 0]
