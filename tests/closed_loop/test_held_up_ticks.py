@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import sitl.lockstep
 from swarmctl.core.clock import SimClock
 from tests.closed_loop.conftest import Flight, Fly
 
@@ -57,8 +56,8 @@ def test_reference_and_records_of_a_held_up_tick_are_of_its_beginning(
         clocks.append(BusyClock())
         return clocks[-1]
 
-    monkeypatch.setattr(sitl.lockstep, "SimClock", busy_clock)
-    monkeypatch.setattr(sitl.lockstep.time, "perf_counter_ns", lambda: clocks[-1].look_ns())
+    monkeypatch.setattr("sitl.lockstep.SimClock", busy_clock)
+    monkeypatch.setattr("sitl.lockstep.time.perf_counter_ns", lambda: clocks[-1].look_ns())
     ticks = flown(fly, mode).ticks(0)
     assert len(np.unique(ticks["utc_us"] - ticks["t_us"])) == 1
     tracked = ticks[np.isfinite(ticks["mission_t_s"])]
