@@ -22,8 +22,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, get_args
 
-from swarmctl.config_problems import validated
-from swarmctl.config_source import override
+from swarmctl.configuration.problems import validated
+from swarmctl.configuration.source import override
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
 from swarmctl.simulator_config import SimulatorConfig
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sitl.world import SitlWorld
-from swarmctl.config_problems import validated
+from swarmctl.configuration.problems import validated
 from swarmctl.errors import ConfigError
 from swarmctl.process_lifetime import remove_socket
 from swarmctl.simulator_config import FaultParams

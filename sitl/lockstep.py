@@ -23,15 +23,16 @@ from sitl.world import SitlWorld
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import CommandMessage, encode_message, first_list
-from swarmctl.bus.links import Impairments
-from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.local.hub import LocalHub
+from swarmctl.bus.local.links import Impairments
+from swarmctl.bus.messages.json_messages import CommandMessage, encode_message, first_list
 from swarmctl.bus.relay import RelayingBus
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows
+from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows
 from swarmctl.core.types import Plan
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel

@@ -19,12 +19,12 @@ from rich.progress import Progress
 
 from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
-from swarmctl.config_view import viewed_flight
-from swarmctl.config_warnings import warning_lines
+from swarmctl.configuration.doubts import warning_lines
+from swarmctl.configuration.view import viewed_flight
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
 from swarmctl.files import replace_bytes, replace_text, write_each
-from swarmctl.ops.status_table import PlainLines
-from swarmctl.ops.summary import summary_lines, unwritten_line, violation_lines
+from swarmctl.ops.flight.summary import summary_lines, unwritten_line, violation_lines
+from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.run_files import load_run, read_plans
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run

@@ -30,7 +30,7 @@ from sitl.px4.link.streams import Report
 from sitl.px4.navigator import IDLE, Navigator
 from sitl.px4.parameters import Parameters
 from sitl.vehicle_parts import Commander, MavlinkInterface
-from swarmctl.core.records import TRUTH_DTYPE
+from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.core.types import FlightMode, GeoOrigin
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.signing.signature import SigningKey

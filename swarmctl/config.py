@@ -18,10 +18,10 @@ import tomli_w
 from pydantic import Field
 
 from swarmctl.agent.setup import AgentParams
-from swarmctl.bus.json_messages import MAX_OBSTACLES
+from swarmctl.bus.messages.json_messages import MAX_OBSTACLES
 from swarmctl.bus.network.hosts import HostParams, host_problems, roster_of
 from swarmctl.bus.network.roster import OwnIdentity
-from swarmctl.config_constraints import (
+from swarmctl.configuration.constraints import (
     forward_problems,
     obstacle_problems,
     own_controller_problems,
@@ -31,9 +31,9 @@ from swarmctl.config_constraints import (
     vehicle_problems,
     volume_problems,
 )
-from swarmctl.config_obstacles import read_obstacles
-from swarmctl.config_problems import validated
-from swarmctl.config_sections import (
+from swarmctl.configuration.obstacles import read_obstacles
+from swarmctl.configuration.problems import validated
+from swarmctl.configuration.sections import (
     BusParams,
     LimitParams,
     MavlinkParams,
@@ -43,18 +43,18 @@ from swarmctl.config_sections import (
     TelemetryParams,
     VehicleParams,
 )
-from swarmctl.config_shows import read_show
-from swarmctl.config_source import override, read_tree, set_value
-from swarmctl.config_tables import read_tables
+from swarmctl.configuration.shows import read_show
+from swarmctl.configuration.source import override, read_tree, set_value
+from swarmctl.configuration.tables import read_tables
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.feasibility import FlightLimits, infeasible
 from swarmctl.control.reference.kind import Place
 from swarmctl.control.reference.mission import MissionParams
+from swarmctl.core.discovery.own import OwnError
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.own import OwnError
 from swarmctl.core.params import FARTHEST_M, Params
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.geofence import GeofenceParams

@@ -15,12 +15,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from swarmctl.config_problems import problems_of
+from swarmctl.configuration.problems import problems_of
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.mission import MissionParams
-from swarmctl.core.own import OwnError
+from swarmctl.core.discovery.own import OwnError
 from swarmctl.core.params import Params
 
 OWN_FOLDER = "own_folder"  # key of a configuration

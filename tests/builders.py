@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from swarmctl.bus.json_messages import StatusMessage
+from swarmctl.bus.messages.json_messages import StatusMessage
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.commit.trajectory_planner import DesiredReference, Situation
 from swarmctl.control.mpc.problem import Start

@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 from pathlib import Path
 
-from swarmctl.config_keys import Key, Section, sections, value_text
+from swarmctl.configuration.keys import Key, Section, sections, value_text
 from swarmctl.core.params import Params
 from swarmctl.simulator_config import FAULTS
 

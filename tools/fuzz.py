@@ -29,8 +29,9 @@ from pymavlink.dialects.v20 import development as dialect
 from sitl.fault_socket import handle
 from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
-from swarmctl.bus.commitment_messages import decode_trajectory_message
-from swarmctl.bus.json_messages import (
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.messages.commitment_messages import decode_trajectory_message
+from swarmctl.bus.messages.json_messages import (
     AnswerMessage,
     decode_answer,
     decode_command,
@@ -38,15 +39,14 @@ from swarmctl.bus.json_messages import (
     decode_status,
     encode_message,
 )
+from swarmctl.bus.messages.path_messages import decode_path
 from swarmctl.bus.network.hosts import roster_of
 from swarmctl.bus.network.seals import KEY_BYTES, Sealer, SealVerifier
-from swarmctl.bus.path_messages import decode_path
-from swarmctl.bus.peers import agent_name
 from swarmctl.bus.relay import decode_relay, encode_relay
 from swarmctl.config import load
-from swarmctl.config_shows import read_show
-from swarmctl.config_tables import read_tables
-from swarmctl.core.records import TICK_DTYPE, unpack_tick
+from swarmctl.configuration.shows import read_show
+from swarmctl.configuration.tables import read_tables
+from swarmctl.core.recorded.records import TICK_DTYPE, unpack_tick
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames

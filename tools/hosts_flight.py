@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from swarmctl.bus.network.hosts import HostParams, ip_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.config import Config, load
-from swarmctl.core.records import TRUTH_COLUMNS, TRUTH_DTYPE
+from swarmctl.core.recorded.records import TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, TRUTH, read_parquet, read_rows
 
 CONFIG = Path(__file__).parents[1] / "configs" / "three_hosts.toml"

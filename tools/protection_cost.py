@@ -26,17 +26,18 @@ import psutil
 
 from sitl.lockstep import Lockstep
 from swarmctl.agent.agent import Agent
+from swarmctl.bus.bus import Bus, Subscriptions, agent_name
+from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.network.hosts import HostParams, links_of, roster_of
 from swarmctl.bus.network.identities import make_identities
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.roster import OwnIdentity, identity_of_json
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
-from swarmctl.bus.peers import Bus, LocalHub, Subscriptions, agent_name
 from swarmctl.bus.topics import PATH, STATUS, TICK, TRAJECTORY
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config, load
-from swarmctl.core.tick_record import TickRecord
+from swarmctl.core.recorded.tick_record import TickRecord
 from swarmctl.core.types import Phase
 from swarmctl.mavlink.signing.key_file import write_new_key
 from swarmctl.wall_clock import WallClock

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swarmctl.core.tick_record import COLUMNS, Column
+from swarmctl.core.recorded.tick_record import COLUMNS, Column
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "data_formats.md"

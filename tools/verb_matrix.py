@@ -21,15 +21,15 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from swarmctl.bus.json_messages import MissionMessage, StatusMessage, decode_status, encode_message
-from swarmctl.bus.peers import agent_name
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.messages.json_messages import MissionMessage, StatusMessage, decode_status, encode_message
 from swarmctl.bus.topics import MISSION as MISSION_TOPIC
 from swarmctl.bus.topics import STATUS
 from swarmctl.core.operator_verbs import BEGIN, EXCLUDE, GOTO, MISSION, OPERATOR_VERBS, PEER, POINT, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import StartError
-from swarmctl.ops.operator import LAUNCH_FILE, RunningLaunch, find_launch, joined
-from swarmctl.ops.order_delivery import Reply, deliver
+from swarmctl.ops.orders.operator import LAUNCH_FILE, RunningLaunch, find_launch, joined
+from swarmctl.ops.orders.order_delivery import Reply, deliver
 
 AGENTS = 2
 _MISSION = MissionMessage(mission=7, text='{"kind": "hover", "duration_s": 40.0}')

@@ -39,7 +39,7 @@ from swarmctl.agent.watches.deadline_watch import DeadlineWatch
 from swarmctl.agent.watches.vehicle_watch import VehicleWatch
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.operator_verbs import Order
-from swarmctl.core.tick_record import TickRecord, TickTiming
+from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import (
     NO_TIMES,
     AttitudeSetpoint,

@@ -9,7 +9,7 @@ import numpy as np
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.ports import Ports, TickSink
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.bus.peers import Bus
+from swarmctl.bus.bus import Bus
 from swarmctl.bus.topics import OPERATOR
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config

@@ -18,9 +18,10 @@ from types import MappingProxyType
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
+from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
-from swarmctl.bus.peers import Bus, LocalHub, agent_name
 from swarmctl.bus.relay import RelayingBus
 from swarmctl.bus.silence import SessionWatch
 from swarmctl.bus.zenoh_bus import NO_BUS

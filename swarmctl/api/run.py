@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.config import Config, load_recorded
-from swarmctl.core.records import PLAN_COLUMNS, TRUTH_COLUMNS
-from swarmctl.core.tick_record import COLUMNS
+from swarmctl.core.recorded.records import PLAN_COLUMNS, TRUTH_COLUMNS
+from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.errors import ConfigError
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.recording.run_files import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from swarmctl.bus.json_messages import CommandMessage, decode_command, encode_message
+from swarmctl.bus.messages.json_messages import CommandMessage, decode_command, encode_message
 from swarmctl.bus.refusals import FUTURE_ORDER, MALFORMED, REPLAYED, SEQUENCE, STALE_ORDER, SUPERSEDED_ORDER, Refusals
 from swarmctl.bus.topics import COMMAND, Topic
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, UNNUMBERED, Answer, Order

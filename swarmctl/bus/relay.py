@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 
-from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.refusals import RefusedMessage
 from swarmctl.bus.topics import RELAY, TOO_LONG, TRAJECTORY, Topic
 from swarmctl.core.trajectory_message import TrajectoryMessage

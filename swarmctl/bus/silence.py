@@ -8,10 +8,8 @@ that one is as silent, silence is what it seems.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from swarmctl.bus.peers import Bus
+from swarmctl.bus.bus import Bus
 
 REOPENED = "bus_reopened"  # event of agents, supervisors and stations
 DEAF_S = 3.0  # supervisors repeat the obstacles each second, agents publish five statuses and fifty paths

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
-from swarmctl.bus.peers import Bus
+from swarmctl.bus.bus import Bus
 from swarmctl.bus.refusals import RefusedMessage
 from swarmctl.bus.topics import RELAY, Topic
 

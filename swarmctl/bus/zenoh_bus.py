@@ -12,7 +12,7 @@ import json
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import Any
 
 import zenoh
 
-from swarmctl.bus.refusals import RefusedMessage
+from swarmctl.bus.bus import Bus
 from swarmctl.bus.silence import DEAF_S, SilenceWatch
 from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
 from swarmctl.errors import StartError
@@ -59,8 +59,8 @@ class _Joined:
     own_token: Any
 
 
-class ZenohBus:
-    """Implements `swarmctl.bus.peers.Bus` by a client session, which is replaced when it is deaf.
+class ZenohBus(Bus):
+    """A client session, which is replaced when it is deaf.
 
     Zenoh connects a session again whose link was lost. What it can't mend is a session that sends and is kept alive but
     receives nothing. So where nobody at all is heard for a while, another session is opened in the background, and
@@ -125,14 +125,6 @@ class ZenohBus:
         if self._silence.is_deaf(time.monotonic()):
             self.reopen()
         return arrived
-
-    def refused(self) -> list[RefusedMessage]:
-        """Return nothing: whether a message is its sender's is not judged here."""
-        return []
-
-    def relay(self, agents: Iterable[int]) -> int:
-        """Pass on nothing: a `RelayingBus` round this one does."""
-        return 0
 
     def alive(self) -> frozenset[str]:
         """Return senders whose liveliness token is present; none, not even this one, while the router is lost."""

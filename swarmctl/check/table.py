@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from swarmctl.bus.peers import agent_name
+from swarmctl.bus.bus import agent_name
 from swarmctl.check.change import Change
 from swarmctl.check.finding import SWARM, Finding, worst_first
 from swarmctl.check.scan.link_facts import VehicleFacts

@@ -19,16 +19,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from swarmctl import __version__
-from swarmctl.bus.peers import agent_name
+from swarmctl.bus.bus import agent_name
 from swarmctl.check.parameters import unchangeable
 from swarmctl.check.scan.link_facts import VehicleFacts
 from swarmctl.check.scan.scanner import run_scans
 from swarmctl.config import Config, load_recorded
-from swarmctl.config_sections import MavlinkParams
+from swarmctl.configuration.sections import MavlinkParams
 from swarmctl.errors import StartError
 from swarmctl.files import replaced
 from swarmctl.mavlink.dialects.discovery import DIALECTS
-from swarmctl.ops.vehicle_links import open_links
+from swarmctl.ops.vehicles.vehicle_links import open_links
 from swarmctl.process_lifetime import StopRequest
 
 if TYPE_CHECKING:

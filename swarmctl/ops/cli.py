@@ -27,8 +27,8 @@ from swarmctl.ops.verbs.obstacles import obstacle_app
 from swarmctl.ops.verbs.orders import AsJson, Run, add_order_verbs
 
 if TYPE_CHECKING:
-    from swarmctl.bus.json_messages import StatusMessage
-    from swarmctl.ops.operator import RunningLaunch
+    from swarmctl.bus.messages.json_messages import StatusMessage
+    from swarmctl.ops.orders.operator import RunningLaunch
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -116,8 +116,8 @@ def launch(
 ) -> int:
     """Start simulator, agents, bus and view, and fly. Ctrl-C lands; a second Ctrl-C kills every process."""
     from swarmctl.config import load
-    from swarmctl.ops.launch import LaunchOptions
-    from swarmctl.ops.launch import launch as fly
+    from swarmctl.ops.flight.launch import LaunchOptions
+    from swarmctl.ops.flight.launch import launch as fly
     from swarmctl.telemetry.view.recordings import wants_window
 
     options = LaunchOptions(run_dir, wants_window(view, web=web), web)
@@ -166,8 +166,8 @@ def check(
 ) -> int:
     """Pre-flight check of every vehicle. Exit code 0: ready; 3: a vehicle is not reached; 4: something is to fix."""
     from swarmctl.config import load
-    from swarmctl.ops.vehicle_check import CheckOptions
-    from swarmctl.ops.vehicle_check import check as check_vehicles
+    from swarmctl.ops.vehicles.vehicle_check import CheckOptions
+    from swarmctl.ops.vehicles.vehicle_check import check as check_vehicles
 
     if write is not None and not identify:
         raise ConfigError("--write", ["there is nothing to write without --identify"])
@@ -177,7 +177,7 @@ def check(
     )
     if not identify:
         return check_vehicles(asked, options)
-    from swarmctl.ops.identify import IdentifyOptions, check_and_identify
+    from swarmctl.ops.vehicles.identify import IdentifyOptions, check_and_identify
 
     return check_and_identify(asked, IdentifyOptions(options, write))
 
@@ -231,7 +231,7 @@ def status(
     watch: Annotated[bool, typer.Option("--watch", help="Go on until the launch ends, or Ctrl-C.")] = False,
 ) -> int:
     """Show the status of every agent of a running launch."""
-    from swarmctl.ops import operator
+    from swarmctl.ops.orders import operator
 
     launch = operator.find_launch(run)
     if watch:
@@ -248,8 +248,8 @@ def status(
 
 def _watch(launch: RunningLaunch, as_json: bool) -> None:
     """Show statuses until the launch ends: a live table, lines where there is no terminal, or lines of JSON."""
-    from swarmctl.ops import operator
-    from swarmctl.ops.status_table import AgentView, open_display
+    from swarmctl.ops.orders import operator
+    from swarmctl.ops.supervision.status_table import AgentView, open_display
 
     views = [AgentView(agent=agent) for agent in range(launch.agents)]
     display = None if as_json else open_display(run=launch.run)
@@ -284,8 +284,8 @@ def fault(
     as_json: AsJson = False,
 ) -> int:
     """Inject a fault into the simulator of a running launch. Refused where real vehicles fly."""
-    from swarmctl.ops import fault as faults
-    from swarmctl.ops import operator
+    from swarmctl.ops.orders import fault as faults
+    from swarmctl.ops.orders import operator
 
     launch = operator.find_launch(run)
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
@@ -301,7 +301,7 @@ def fault(
 @app.command()
 def view(run: Run = None, web: Web = False) -> int:
     """Open the live view of a running launch."""
-    from swarmctl.ops import operator
+    from swarmctl.ops.orders import operator
     from swarmctl.telemetry.view.recordings import open_viewer
 
     address = operator.view_address(operator.find_launch(run))
@@ -351,7 +351,7 @@ def _overrides(agents: int | None, duration: float | None, seed: int | None, set
 
 
 def _show(launch: RunningLaunch, statuses: dict[int, StatusMessage]) -> None:
-    from swarmctl.ops.status_table import AgentView, print_statuses
+    from swarmctl.ops.supervision.status_table import AgentView, print_statuses
 
     print(f"status: {launch.run}", file=sys.stderr)  # rows alone on standard output
     views = [AgentView(agent=number, status=statuses.get(number)) for number in range(launch.agents)]

@@ -14,7 +14,7 @@ import msgspec
 
 from swarmctl.built_in_configs import EXAMPLES, built_in_files
 from swarmctl.config import Config
-from swarmctl.config_keys import Key, Section, meanings, model_in, sections, value_text
+from swarmctl.configuration.keys import Key, Section, meanings, model_in, sections, value_text
 from swarmctl.core.params import Params
 from swarmctl.errors import ConfigError, StartError
 

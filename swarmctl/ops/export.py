@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from swarmctl.config import load_recorded
-from swarmctl.config_view import viewed_flight
+from swarmctl.configuration.view import viewed_flight
 from swarmctl.errors import StartError
 from swarmctl.telemetry.export.mcap import RecordedFlight, write_mcap
 from swarmctl.telemetry.recording.run_files import read_plans

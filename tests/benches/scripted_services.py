@@ -9,16 +9,17 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from swarmctl.bus.json_messages import decode_command, encode_message
-from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.local.hub import LocalHub
+from swarmctl.bus.messages.json_messages import decode_command, encode_message
 from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, OPERATOR, STATUS
 from swarmctl.config import load
 from swarmctl.core.operator_verbs import EXCLUDE, PEER
 from swarmctl.core.types import Phase
-from swarmctl.ops.launch_result import LaunchResult
-from swarmctl.ops.processes import ROUTER, Child, Command, RunContext, kill_all
-from swarmctl.ops.status_table import AgentView
-from swarmctl.ops.supervisor import FlightSupervisor, Services
+from swarmctl.ops.flight.launch_result import LaunchResult
+from swarmctl.ops.flight.processes import ROUTER, Child, Command, RunContext, kill_all
+from swarmctl.ops.supervision.status_table import AgentView
+from swarmctl.ops.supervision.supervisor import FlightSupervisor, Services
 from swarmctl.telemetry.recording.event_log import EventLog
 from tests import builders
 

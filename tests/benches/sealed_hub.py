@@ -7,13 +7,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from swarmctl.bus.bus import Bus, Subscriptions, agent_name
+from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.network.hosts import HostParams, roster_of
 from swarmctl.bus.network.identities import make_identities
 from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.bus.network.roster import OwnIdentity, Roster, Speaker
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US, SealedBus
 from swarmctl.bus.network.seals import PairKeys, Sealer, SealVerifier
-from swarmctl.bus.peers import Bus, LocalHub, Subscriptions, agent_name
 from swarmctl.bus.topics import OPERATOR
 
 RUN = "run"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmctl.core.tick_record import TickRecord, TickTiming
+from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import (
     AttitudeSetpoint,
     ControlMode,

@@ -10,8 +10,8 @@ import pytest
 from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
+from swarmctl.bus.bus import agent_name
 from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import agent_name
 from swarmctl.core.clock import ClockError
 from tests.benches.guaranteed_trials import COMMITTED_M, TOUCH_M, events, flown
 

@@ -17,7 +17,7 @@ from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.agent.planning import coordination
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.agent.planning.separation_policy import Guaranteed
-from swarmctl.bus.peers import agent_name
+from swarmctl.bus.bus import agent_name
 from tests.benches.guaranteed_trials import COMMITTED_M, TOUCH_M, events
 
 

@@ -9,12 +9,12 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import encode_message
+from swarmctl.bus.messages.json_messages import encode_message
 from swarmctl.config import load, load_mission
 from swarmctl.core.operator_verbs import BEGIN, MISSION
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
-from swarmctl.ops.mission_file import mission_message
+from swarmctl.ops.orders.mission_file import mission_message
 from tests.closed_loop.test_operator import fly_for, fly_until, outcome, phase
 
 HOVER = ("swarm.agents=2", "start.positions_ned_m=[[0,0,-3],[4,0,-3]]", "mission.kind=hover", "sitl.start=air")

@@ -15,10 +15,11 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.local.hub import LocalHub
+from swarmctl.bus.messages.path_messages import decode_path, encode_path
 from swarmctl.bus.network.hosts import HostParams
 from swarmctl.bus.network.seals import overhead_bytes
-from swarmctl.bus.path_messages import decode_path, encode_path
-from swarmctl.bus.peers import LocalHub, agent_name
 from tests.benches.sealed_hub import SealedHub
 from tests.closed_loop.conftest import Flight, Fly, fly_now
 from tests.closed_loop.test_forgery import FORGED_S, VICTIM, overhear, summary, swap

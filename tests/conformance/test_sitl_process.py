@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
-from swarmctl.core.records import TRUTH_DTYPE
+from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
 from swarmctl.process_priority import is_realtime_permitted

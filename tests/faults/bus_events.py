@@ -11,8 +11,9 @@ import numpy as np
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.agent.sensing.world_model import WorldModel
-from swarmctl.bus.path_messages import decode_path, encode_path
-from swarmctl.bus.peers import PeerPaths, agent_name
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.messages.path_messages import decode_path, encode_path
+from swarmctl.bus.peers import PeerPaths
 from swarmctl.bus.senders import SenderVerifier
 from swarmctl.bus.topics import PATH, Topic
 from swarmctl.core.types import Array, PredictedPath

@@ -7,7 +7,7 @@ from functools import partial
 
 from swarmctl import wall_clock
 from swarmctl.agent.planning import coordination
-from swarmctl.bus.peers import agent_name
+from swarmctl.bus.bus import agent_name
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.wall_clock import WallClock
 from tests.faults.bus_events import FORGETS, arrived, for_, others_arrived, rests

@@ -5,7 +5,8 @@ from __future__ import annotations
 from swarmctl.agent.planning import coordination
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.agent.sensing import world_model
-from swarmctl.bus import inboxes, peers
+from swarmctl.bus import peers
+from swarmctl.bus.local import inboxes
 from swarmctl.bus.peers import PeerPaths
 from tests.faults.bus_events import (
     BELIEVES_ALL,

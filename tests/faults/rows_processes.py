@@ -39,8 +39,8 @@ from tests.process.test_launch import (
     without_its_router_the_flight_goes_on_with_another,
 )
 
-SUPERVISOR = "import swarmctl.ops.supervisor as supervisor\n"
-HEARING = "import swarmctl.ops.hearing as hearing\n"
+SUPERVISOR = "import swarmctl.ops.supervision.supervisor as supervisor\n"
+HEARING = "import swarmctl.ops.supervision.hearing as hearing\n"
 RAISES = """
 import json
 import swarmctl.telemetry.recording.event_log as log
@@ -235,7 +235,7 @@ ROWS = (
         script=reader_ends,
         off=in_program(
             "launch",
-            "import swarmctl.ops.status_table as it\n"
+            "import swarmctl.ops.supervision.status_table as it\n"
             "it.PlainLines.print_line = lambda self, text: print(text, flush=True)",
         ),
     ),
@@ -316,7 +316,7 @@ ROWS = (
         protection="pre-flight check of the vehicles' links",
         script=ports_taken,
         readable=False,
-        off=in_program("launch", "import swarmctl.ops.preflight as it\nit._vehicle_problems = lambda *_: ()"),
+        off=in_program("launch", "import swarmctl.ops.flight.preflight as it\nit._vehicle_problems = lambda *_: ()"),
     ),
     LaunchedRow(
         name="start-vehicle-missing",

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.identities import add_identity, make_identities, revoke_identity
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
-from swarmctl.bus.peers import Bus
 from swarmctl.bus.topics import COMMAND, ENDED, MISSION, OBSTACLES, PATH, STATUS, Topic
 from swarmctl.bus.zenoh_bus import ZenohBus
 from tests.benches.free_ports import free_ports

@@ -24,8 +24,8 @@ from swarmctl.errors import StartError
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.signing.key_file import write_new_key
-from swarmctl.ops.key_install import install
-from swarmctl.ops.vehicle_check import CheckOptions, check
+from swarmctl.ops.vehicles.key_install import install
+from swarmctl.ops.vehicles.vehicle_check import CheckOptions, check
 from tests.benches.free_ports import free_ports
 
 pytestmark = pytest.mark.process

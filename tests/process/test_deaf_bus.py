@@ -16,11 +16,11 @@ import pytest
 import zenoh
 
 import swarmctl.bus.zenoh_bus as zenoh_bus
+from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.identities import make_identities
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
-from swarmctl.bus.peers import Bus
 from swarmctl.bus.topics import COMMAND, PATH, STATUS
 from swarmctl.bus.zenoh_bus import ZenohBus
 from swarmctl.errors import StartError

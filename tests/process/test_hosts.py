@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmctl.core.records import TRUTH_COLUMNS
+from swarmctl.core.recorded.records import TRUTH_COLUMNS
 from swarmctl.ops.cli import main
 from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, read_parquet
 from tests.benches.free_ports import free_ports

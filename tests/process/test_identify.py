@@ -16,7 +16,7 @@ import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.config import load
-from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.types import Landed, Phase
 from swarmctl.telemetry.recording.run_files import load_run
 from tests.benches.at_once import at_once

@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-import swarmctl.ops.recovery
-import swarmctl.ops.supervisor
-from swarmctl.bus.json_messages import decode_obstacles, encode_message, first_list
+import swarmctl.ops.supervision.recovery
+import swarmctl.ops.supervision.supervisor
+from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.messages.json_messages import decode_obstacles, encode_message, first_list
 from swarmctl.bus.orders import Orders
-from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import OBSTACLES, OPERATOR, Topic
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
-from swarmctl.ops.hearing import Hearing
-from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child
+from swarmctl.ops.flight.processes import ROUTER, SITL, VIEWER, Child
+from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
 from swarmctl.telemetry.recording.run_files import read_events
@@ -52,9 +52,9 @@ class DeafBus(CountedBus):
 
 @pytest.fixture(autouse=True)
 def short_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(swarmctl.ops.supervisor, "_SILENCE_S", 1.0)
-    monkeypatch.setattr(swarmctl.ops.supervisor, "_AFTER_DEATH_S", 0.5)
-    monkeypatch.setattr(swarmctl.ops.supervisor, "_LAND_OBEYED_S", 1.0)
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_SILENCE_S", 1.0)
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_AFTER_DEATH_S", 0.5)
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_LAND_OBEYED_S", 1.0)
 
 
 def test_all_agents_finish(tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_an_interrupted_launch_that_leaves_a_vehicle_is_a_failed_one(tmp_path: P
 def test_a_recovery_that_takes_too_long_is_ended_and_the_vehicle_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(swarmctl.ops.recovery, "RECOVERY_S", 1.0)
+    monkeypatch.setattr(swarmctl.ops.supervision.recovery, "RECOVERY_S", 1.0)
     scene = ScriptedServices(tmp_path, [FLIES_LONG, ends(0, 1.0)])
     scene.lands = FLIES_LONG
     scene.act = lambda: scene.kill("agent-0")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED
 from swarmctl.mavlink.codec import Codec

@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from sitl.studies.bench.bench import PARTS
+from sitl.studies.bench.ticks import PARTS
 from swarmctl.config import load
 from swarmctl.control.mpc.solvers.qp import SOLVERS
 from swarmctl.core.types import Landed

@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from swarmctl.bus.path_messages import encode_path
-from swarmctl.bus.peers import PeerPaths, agent_name
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.messages.path_messages import encode_path
+from swarmctl.bus.peers import PeerPaths
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import SILENCE_US, Presence
 from swarmctl.bus.topics import PATH
@@ -29,7 +30,7 @@ import sys, time
 import numpy as np
 from swarmctl.core.types import PredictedPath
 from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.path_messages import encode_path
+from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.bus.topics import PATH
 bus = ZenohBus(sys.argv[1], "run", "agent-1", {}, lease_ms=1000)
 seq = 0

@@ -15,16 +15,16 @@ import time
 import pyte
 import pytest
 
-from swarmctl.ops.status_table import COLUMNS
-from tests.unit.ops.test_status_table import fleet
+from swarmctl.ops.supervision.status_table import COLUMNS
+from tests.unit.ops.supervision.test_status_table import fleet
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(60)]
 
 WIDTH, HEIGHT, LINES = 80, 24, 4
 SHOW = """
 import sys, time
-from swarmctl.ops.status_table import open_display
-from tests.unit.ops.test_status_table import fleet
+from swarmctl.ops.supervision.status_table import open_display
+from tests.unit.ops.supervision.test_status_table import fleet
 views, display = fleet(int(sys.argv[1])), open_display(run="swarm")
 for k in range(int(sys.argv[2])):
     display.print_line(f"line {k} above the table")

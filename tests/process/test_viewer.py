@@ -24,8 +24,8 @@ import psutil
 import pytest
 import zenoh
 
-from swarmctl.core.records import TICK_DTYPE
-from swarmctl.core.tick_record import COLUMNS
+from swarmctl.core.recorded.records import TICK_DTYPE
+from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.view.recordings import optimize_recording, viewer_binary
 

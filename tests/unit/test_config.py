@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmctl.bus.json_messages import MAX_OBSTACLES
+from swarmctl.bus.messages.json_messages import MAX_OBSTACLES
 from swarmctl.config import _RENAMED, Config, dump, load
-from swarmctl.config_problems import all_keys
+from swarmctl.configuration.problems import all_keys
 from swarmctl.control.reference.kinds.circle import CircleParams
 from swarmctl.errors import EXIT_USAGE, ConfigError
 from swarmctl.mavlink.signing.key_file import write_new_key

@@ -13,11 +13,11 @@ import pytest
 import swarmctl
 from sitl.studies.campaign.trials import SCHEMA
 from sitl.studies.sweep.figures import schema_of
-from swarmctl.config_sections import SitlParams
+from swarmctl.configuration.sections import SitlParams
 from swarmctl.control.controllers.own import GROUP as CONTROLLERS_OFFERED
 from swarmctl.control.reference.mission import GROUP as MISSIONS_OFFERED
 from swarmctl.core.operator_verbs import OPERATOR_VERBS
-from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Phase
 
 ROOT = Path(__file__).parents[2]

@@ -3,9 +3,8 @@
 Its options are in `command`.
 
 One real agent among neighbours that are paths on the bus (see `formation`), no process, no socket: what is measured is
-the work of a tick. Solvers take turns tick by tick, so that their ratios are fair on a busy machine. Ticks are timed by
-the wall clock, as in flight, x-y problems alone on the processor (see `captured`). Garbage collection is on, as in
-flight. Writes `bench.json`, a list of rows of five keys.
+the work of a tick (see `ticks`), and x-y problems alone on the processor (see `captured`). Garbage collection is on, as
+in flight. Writes `bench.json`, a list of rows of five keys. `--scale` asks how costs grow instead (see `scale`).
 """
 
 from __future__ import annotations
@@ -13,18 +12,17 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, astuple, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Column, Table
 
-from sitl.lockstep import Lockstep
+from sitl.studies.bench import scale
 from sitl.studies.bench.captured import (
     MOST_PROBLEMS,
     WARM_UP,
@@ -33,29 +31,19 @@ from sitl.studies.bench.captured import (
     capture,
     circle_with_obstacle,
     measure_xy,
-    settled_garbage,
     times_of,
 )
-from sitl.studies.bench.formation import Formation, formation_config
-from sitl.studies.campaign.flight import config_of
-from sitl.studies.campaign.scenarios import layout_of
-from sitl.studies.campaign.trials import Cell
-from swarmctl.config import Config
+from sitl.studies.bench.ticks import PARTS, measure_commitments, measure_ticks
 from swarmctl.control.mpc.solvers.qp import SOLVERS, installed_solvers
-from swarmctl.core.tick_record import TickTiming
-from swarmctl.core.types import Array, Phase
-from swarmctl.errors import EXIT_OK, ConfigError, MissionError
+from swarmctl.core.types import Array
+from swarmctl.errors import EXIT_OK, ConfigError
 from swarmctl.files import replace_text
 
-PARTS = ("sense", "setup", "commitment", "spaces", "solve", "certify", "barrier", "send", "tick")
 _BESIDE_PILLAR = 2  # neighbours in the scenario with an obstacle
-_WARM_UP_S = 5.0  # mission time for catching up with the circle
-_READY_WITHIN_TICKS = 1500
 _OBSTACLE = ", 1 obstacle"
 _GUARANTEED = ", guaranteed"
 _GUARANTEED_NEIGHBOURS = 9  # neighbours in the scenario with commitments
 _PART_WIDTH, _CASE_WIDTH = 16, 21  # of columns in the terminal, with the room between them
-_ENDLESS_S = 3600.0
 _BUSY_LOAD = 0.7  # one-minute load average
 
 
@@ -68,90 +56,6 @@ class BenchRow:
     neighbours: int
     p50_ms: float
     p99_ms: float
-
-
-def measure_ticks(
-    neighbours: int,
-    solvers: Sequence[str],
-    ticks: int,
-    pillar: bool = False,
-    *,
-    on_tick: Callable[[], None] = lambda: None,
-) -> dict[str, Array]:
-    """Return the parts of `ticks` ticks, (ticks, 9) [ms] in the order of `PARTS`, by solver.
-
-    Raises:
-        MissionError: an agent did not reach the mission, or had no plan at a counted tick, which would be no valid
-        figure.
-    """
-    formations = {solver: Formation(formation_config(solver, neighbours, pillar)) for solver in solvers}
-    for solver, formation in formations.items():
-        _get_under_way(solver, formation.step, partial(_is_warm, formation))
-    timings: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
-    with settled_garbage():
-        for _ in range(ticks):
-            for solver, formation in formations.items():
-                formation.step()
-                if not formation.planned:
-                    raise MissionError(f"bench: {solver} with {neighbours} neighbours: a tick without a plan")
-                timings[solver].append(_parts(formation.timing))
-            on_tick()
-    return {solver: np.array(rows) for solver, rows in timings.items()}
-
-
-def measure_commitments(
-    neighbours: int, solvers: Sequence[str], ticks: int, on_tick: Callable[[], None] = lambda: None
-) -> dict[str, Array]:
-    """Measure `neighbours + 1` agents in a swap with guaranteed commitments; (ticks, 9) [ms] over all agents.
-
-    The neighbours of `measure_ticks` are paths only and can't commit, so every neighbour is a whole agent here.
-    """
-    crowds = {solver: Lockstep(_swap_config(solver, neighbours + 1)) for solver in solvers}
-    timings: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
-    for solver, crowd in crowds.items():
-        _get_under_way(solver, crowd.step, partial(_tracks, crowd))
-    with settled_garbage():
-        for _ in range(0, ticks, neighbours + 1):
-            for solver, crowd in crowds.items():
-                crowd.step()
-                timings[solver] += [_parts(agent.timing) for agent in crowd.agents if agent is not None]
-            for _ in range(neighbours + 1):
-                on_tick()
-    return {solver: np.array(rows[:ticks]) for solver, rows in timings.items()}
-
-
-def _swap_config(solver: str, agents: int) -> Config:
-    cell = Cell(
-        scenario="symmetric",
-        agents=agents,
-        delay_ms=0.0,
-        loss=0.0,
-        noise="exact",
-        wind_m_s=0.0,
-        protections="guaranteed",
-    )
-    extra = (f"controller.mpc.qp.solver='{solver}'", f"mission.duration_s={_ENDLESS_S}")
-    return config_of(cell, 1, layout_of(cell.scenario, 1, agents), agents, extra=extra)
-
-
-def _tracks(crowd: Lockstep) -> bool:
-    return int(crowd.logs[0].rows[-1]["phase"][0]) == Phase.TRACK
-
-
-def _is_warm(formation: Formation) -> bool:
-    return formation.mission_t_s >= _WARM_UP_S
-
-
-def _get_under_way(solver: str, step: Callable[[], None], ready: Callable[[], bool]) -> None:
-    for _ in range(_READY_WITHIN_TICKS):
-        step()
-        if ready():
-            return
-    raise MissionError(f"bench: the agent with {solver} did not begin within {_READY_WITHIN_TICKS} ticks")
-
-
-def _parts(timing: TickTiming) -> tuple[float, ...]:
-    return (*astuple(timing), timing.tick_ms)
 
 
 def tick_rows(timings: dict[str, Array], neighbours: int, suffix: str = "") -> list[BenchRow]:
@@ -272,11 +176,25 @@ def run(options: argparse.Namespace) -> int:
     console = Console()
     note = busy_note(os.getloadavg()[0], os.cpu_count() or 1)
     solvers, left_out = chosen_solvers(options.solver or ())
-    if left_out:
+    if left_out and not options.scale:
         console.print(left_out, markup=False)
-    rows = bench(options.neighbours, solvers, options.ticks, options.slsqp, console=console)
-    show(rows, console)
+    if options.scale:
+        written = _run_scale(options, solvers[0], console)
+    else:
+        rows = bench(options.neighbours, solvers, options.ticks, options.slsqp, console=console)
+        show(rows, console)
+        written = [write(rows, options.out)]
     if note:
         console.print(note)
-    console.print(str(write(rows, options.out)))
+    console.print("\n".join(map(str, written)), markup=False)
     return EXIT_OK
+
+
+def _run_scale(options: argparse.Namespace, solver: str, console: Console) -> list[Path]:
+    """Measure how costs grow; return what was written."""
+    with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(f"counts, {solver}", total=len(options.neighbours) + len(options.agents))
+        rows = scale.neighbour_rows(options.neighbours, solver, options.ticks, partial(bar.advance, task))
+        rows += scale.agent_rows(options.agents, solver, options.ticks, partial(bar.advance, task))
+    scale.show(rows, console)
+    return scale.write(rows, options.out)

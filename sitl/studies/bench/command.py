@@ -1,6 +1,7 @@
 """The command line of the `bench` verb. What measures is imported after it is read, so that `--help` is quick.
 
-`python -m sitl.studies.bench.command [--out DIR] [--neighbours 0,1,2] [--solver osqp] [--ticks N] [--no-slsqp]`
+`python -m sitl.studies.bench.command [--scale] [--out DIR] [--neighbours 0,1,2] [--agents 3,6] [--solver osqp]
+[--ticks N] [--no-slsqp]`
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ from swarmctl.errors import exit_code_of
 
 NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
 MAX_NEIGHBOURS = 99
+AGENTS = (3, 6, 12, 24)
+MAX_AGENTS = 100
 SOLVERS = ("osqp", "daqp")  # those of `control.mpc.qp`, which takes a second to import
 _WHAT = """The `bench` verb: measures the duration of an agent's tick, split into parts, for growing swarms and each
-QP solver."""
+QP solver; with --scale, how costs grow with neighbours and agents, with fitted exponents and a plot."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,8 +32,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="swarmctl bench", description=_WHAT)
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of bench.json; default: here")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder to write to; default: here")
     parser.add_argument("--neighbours", metavar="K,K", type=_counts, default=list(NEIGHBOURS), help="counts, 0 to 99")
+    parser.add_argument("--scale", action="store_true", help="how costs grow, with one solver: scale.json, scale.html")
+    parser.add_argument(
+        "--agents", metavar="N,N", type=_agents, default=list(AGENTS), help="counts of --scale, 2 to 100"
+    )
     parser.add_argument("--solver", action="append", choices=SOLVERS, help="repeatable; default: all installed")
     parser.add_argument("--ticks", metavar="N", type=_ticks, default=300, help="measured: ticks, and x-y problems")
     parser.add_argument("--slsqp", action=argparse.BooleanOptionalAction, default=True, help="the nonlinear baseline")
@@ -38,12 +45,20 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _counts(text: str) -> list[int]:
+    return _numbers(text, 0, MAX_NEIGHBOURS)
+
+
+def _agents(text: str) -> list[int]:
+    return _numbers(text, 2, MAX_AGENTS)
+
+
+def _numbers(text: str, least: int, most: int) -> list[int]:
     try:
         counts = [int(part) for part in text.split(",")]
     except ValueError:
         counts = [-1]
-    if not all(0 <= count <= MAX_NEIGHBOURS for count in counts):
-        raise argparse.ArgumentTypeError(f"{text!r}: give numbers from 0 to {MAX_NEIGHBOURS}, such as 0,2,8")
+    if not all(least <= count <= most for count in counts):
+        raise argparse.ArgumentTypeError(f"{text!r}: give numbers from {least} to {most}, such as {least},8")
     return list(dict.fromkeys(counts))
 
 

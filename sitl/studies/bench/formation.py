@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from sitl.world import SitlWorld
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import StatusMessage, encode_message, first_list
-from swarmctl.bus.path_messages import encode_path
-from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.local.hub import LocalHub
+from swarmctl.bus.messages.json_messages import StatusMessage, encode_message, first_list
+from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.config import Config, load
 from swarmctl.core.clock import SimClock
-from swarmctl.core.tick_record import TickRecord, TickTiming
+from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import Array, Phase, Plan, PlanStatus, PredictedPath
 from swarmctl.mavlink.transport import pipe_pair
 

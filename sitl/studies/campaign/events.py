@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from sitl.lockstep import Lockstep
-from swarmctl.bus.peers import agent_name
+from swarmctl.bus.bus import agent_name
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array
 from swarmctl.simulator_config import FaultParams

@@ -10,8 +10,8 @@ from pydantic import ValidationError
 
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import decode_mission
-from swarmctl.bus.peers import Bus
+from swarmctl.bus.bus import Bus
+from swarmctl.bus.messages.json_messages import decode_mission
 from swarmctl.bus.refusals import MALFORMED, Refusals
 from swarmctl.control.phases.trajectories import OfferedMission
 from swarmctl.control.reference.feasibility import FlightLimits, infeasible

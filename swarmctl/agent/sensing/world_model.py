@@ -6,10 +6,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence, Set
 
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import ListedObstacle, StatusMessage, decode_obstacles, decode_status
+from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.messages.json_messages import ListedObstacle, StatusMessage, decode_obstacles, decode_status
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import Bus, PeerPaths, agent_name, peer_verifiers
+from swarmctl.bus.peers import PeerPaths, peer_verifiers
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer

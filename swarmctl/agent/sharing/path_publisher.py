@@ -8,7 +8,7 @@ from swarmctl.agent.ports import Ports
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.sharing.path_sharing import PathSharing
 from swarmctl.bus import topics
-from swarmctl.bus.path_messages import encode_path
+from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
 from swarmctl.control.estimation.gust import GustWatch

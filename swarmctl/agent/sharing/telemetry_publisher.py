@@ -10,14 +10,15 @@ from swarmctl.agent.ports import TickSink
 from swarmctl.agent.tick_results import ControlOutput, PlanningResult
 from swarmctl.agent.watches.alerts import Alert
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import MAX_REASON, AnswerMessage, StatusMessage, encode_message
-from swarmctl.bus.peers import Bus, PeerPaths
+from swarmctl.bus.bus import Bus
+from swarmctl.bus.messages.json_messages import MAX_REASON, AnswerMessage, StatusMessage, encode_message
+from swarmctl.bus.peers import PeerPaths
 from swarmctl.control.estimation.disturbance import Estimate
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.core.clock import Clock
 from swarmctl.core.operator_verbs import Answer
-from swarmctl.core.records import pack_tick, tick_row
-from swarmctl.core.tick_record import TickRecord, TickTiming
+from swarmctl.core.recorded.records import pack_tick, tick_row
+from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import VehicleState
 from swarmctl.mavlink.vehicle.autopilot import Autopilot
 

@@ -9,10 +9,10 @@ from typing import Annotated
 
 from pydantic import Field
 
+from swarmctl.bus.bus import agent_name
 from swarmctl.bus.network.identity_files import AUTHORITY, STATION
 from swarmctl.bus.network.roster import OwnIdentity, Roster, Speaker
 from swarmctl.bus.network.router_links import RouterLinks
-from swarmctl.bus.peers import agent_name
 from swarmctl.bus.topics import OPERATOR
 from swarmctl.core.params import Params
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 
+from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.bus.network.sealed_bus import SealedBus
 from swarmctl.bus.network.seals import Sealer, SealVerifier, overhead_bytes
-from swarmctl.bus.peers import Bus
 from swarmctl.bus.topics import Topic
 from swarmctl.bus.zenoh_bus import CONNECT_TIMEOUT_MS, ZenohBus
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 
+from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.seals import Sealer, SealVerifier
-from swarmctl.bus.peers import Bus
 from swarmctl.bus.refusals import REPLAYED, RefusedMessage
 from swarmctl.bus.topics import OBSTACLES, PATH, STATUS, TOO_LONG, TRAJECTORY, Topic
 

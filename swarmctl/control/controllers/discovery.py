@@ -18,9 +18,9 @@ from swarmctl.control.controllers.kind import Controller, ControllerKind, Contro
 from swarmctl.control.controllers.own import GROUP, OwnController
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
-from swarmctl.core.declared import declared
+from swarmctl.core.discovery.declared import declared
+from swarmctl.core.discovery.own import BuiltInOrOwn, OwnError, in_words, own_class
 from swarmctl.core.flight_volume import FlightVolume
-from swarmctl.core.own import BuiltInOrOwn, OwnError, in_words, own_class
 from swarmctl.core.params import Params, with_sections
 
 _KINDS: list[ControllerKind[Any]] = list(declared(controllers, ControllerKind))

@@ -20,7 +20,7 @@ from swarmctl.control.controllers.kind import Controller, ControllerSetup
 from swarmctl.control.controllers.own import OwnController
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.rollout import ModelledVehicle
-from swarmctl.core.own import in_words, raised_at, traced
+from swarmctl.core.discovery.own import in_words, raised_at, traced
 from swarmctl.core.text import printable
 from swarmctl.core.trajectory import braking_displacement
 from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes, Reference

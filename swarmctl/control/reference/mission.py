@@ -15,8 +15,8 @@ from pydantic import Field
 from swarmctl.control.reference import kinds
 from swarmctl.control.reference.kind import MISSIONS, Heading, MissionKind, Place
 from swarmctl.control.reference.polynomial import through
-from swarmctl.core.declared import modules_of
-from swarmctl.core.own import BuiltInOrOwn, OwnError, in_words, own_class
+from swarmctl.core.discovery.declared import modules_of
+from swarmctl.core.discovery.own import BuiltInOrOwn, OwnError, in_words, own_class
 from swarmctl.core.params import Params, with_sections
 from swarmctl.core.types import Array, Sampled
 

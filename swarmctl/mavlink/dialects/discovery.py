@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from swarmctl.core.declared import declared
+from swarmctl.core.discovery.declared import declared
 from swarmctl.mavlink import dialects
 from swarmctl.mavlink.dialects.dialect import Dialect
 

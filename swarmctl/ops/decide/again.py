@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.agent.assembly import make_agent
-from swarmctl.bus.peers import agent_name
+from swarmctl.bus.bus import agent_name
 from swarmctl.config import Config
-from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.types import Array, Phase, Plan, PlanStatus
 from swarmctl.errors import ConfigError
 from swarmctl.files import read_file

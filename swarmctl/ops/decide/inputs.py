@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import (
+from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.messages.json_messages import (
     CommandMessage,
     MissionMessage,
     StatusMessage,
     encode_message,
     first_list,
 )
-from swarmctl.bus.path_messages import encode_path
-from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.bus.topics import OPERATOR, Topic
 from swarmctl.config import Config
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity

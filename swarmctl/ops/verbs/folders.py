@@ -87,7 +87,7 @@ def report(
     ] = None,
 ) -> int:
     """Write the report of a run again, and complete a run that was cut off; set several runs beside each other."""
-    from swarmctl.ops.summary import compare, rewrite_report, write_figures
+    from swarmctl.ops.flight.summary import compare, rewrite_report, write_figures
 
     if len(folders) > 1:
         if figures or png:

@@ -31,8 +31,8 @@ def host(
     print_unit: Annotated[bool, typer.Option("--print-unit", help="Print a systemd unit instead of flying.")] = False,
 ) -> int:
     """Fly the agents of this computer, together with those of other hosts. Ctrl-C lands them; the others fly on."""
-    from swarmctl.ops.host import fly_host, load_host, systemd_unit
-    from swarmctl.ops.launch import LaunchOptions
+    from swarmctl.ops.flight.host import fly_host, load_host, systemd_unit
+    from swarmctl.ops.flight.launch import LaunchOptions
 
     try:
         numbers = [int(number) for number in agents.split(",")]
@@ -56,8 +56,8 @@ def station(
 ) -> int:
     """Show, record, judge and steer a swarm of several hosts. Ctrl-C ends the station; the swarm flies on."""
     from swarmctl.config import load
-    from swarmctl.ops.launch import LaunchOptions
-    from swarmctl.ops.station import run_station
+    from swarmctl.ops.flight.launch import LaunchOptions
+    from swarmctl.ops.flight.station import run_station
     from swarmctl.telemetry.view.recordings import wants_window
 
     options = LaunchOptions(run_dir, wants_window(view, web=web), web)

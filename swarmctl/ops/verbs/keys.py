@@ -45,7 +45,7 @@ def keys_install(
 ) -> int:
     """Give every disarmed vehicle its key, in clear text: over a cable or a network that nobody else is on."""
     from swarmctl.config import load
-    from swarmctl.ops.key_install import install
+    from swarmctl.ops.vehicles.key_install import install
 
     return install(load(config, sets or ()), old or ())
 
@@ -56,7 +56,7 @@ def keys_init(
     sets: _Set = None,
 ) -> int:
     """Make an authority, and an identity for every host and the station; again, for those that were added."""
-    from swarmctl.ops.host import make_host_identities
+    from swarmctl.ops.flight.host import make_host_identities
 
     folder, made = make_host_identities(config, sets or ())
     print(f"{folder}: made {', '.join(made) or 'nothing: every host has an identity'}")
@@ -70,7 +70,7 @@ def keys_add(
     sets: _Set = None,
 ) -> int:
     """Make the identity of one computer: one that is new, or whose former one is revoked."""
-    from swarmctl.ops.host import add_host_identity
+    from swarmctl.ops.flight.host import add_host_identity
 
     folder = add_host_identity(config, name, sets or ())
     print(f"{folder}: made {name}. Copy {name}.pem to every computer, {name}.key to {name} alone")
@@ -84,7 +84,7 @@ def keys_revoke(
     sets: _Set = None,
 ) -> int:
     """Revoke the identity of one computer. Others honour it from their next start on, once they have the list."""
-    from swarmctl.ops.host import revoke_host_identity
+    from swarmctl.ops.flight.host import revoke_host_identity
 
     revoked = revoke_host_identity(config, name, sets or ())
     print(f"{revoked}: {name} is revoked. Copy this file to every computer; it counts from the next start there on")

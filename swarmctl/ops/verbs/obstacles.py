@@ -15,7 +15,7 @@ from swarmctl.errors import EXIT_OK
 from swarmctl.ops.verbs.orders import AsJson, Run
 
 if TYPE_CHECKING:
-    from swarmctl.bus.json_messages import ListedObstacle, ObstaclesMessage
+    from swarmctl.bus.messages.json_messages import ListedObstacle, ObstaclesMessage
 
 obstacle_app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Change the obstacles of a running launch."
@@ -27,7 +27,7 @@ File = Annotated[Path, typer.Argument(metavar="FILE", help="TOML file of [[obsta
 @obstacle_app.command("list")
 def obstacle_list(run: Run = None, as_json: AsJson = False) -> int:
     """List the obstacles that the agents know: number, place now, sizes, velocity."""
-    from swarmctl.ops import obstacle_list, operator
+    from swarmctl.ops.orders import obstacle_list, operator
 
     launch = operator.find_launch(run)
     return _show(launch.run, obstacle_list.read_obstacles(launch), as_json)
@@ -49,7 +49,7 @@ def obstacle_add(
     as_json: AsJson = False,
 ) -> int:
     """Add a sphere or a column to a running launch."""
-    from swarmctl.ops import obstacle_list
+    from swarmctl.ops.orders import obstacle_list
 
     keep_out_m = radius + 0.75 if keep_out is None else keep_out
     obstacle = obstacle_list.obstacle(center, radius, keep_out_m, visibility, velocity=velocity, column=column)
@@ -69,7 +69,7 @@ def obstacle_move(
     as_json: AsJson = False,
 ) -> int:
     """Put an obstacle elsewhere at once, or give it another velocity. Its number and sizes stay."""
-    from swarmctl.ops import obstacle_list
+    from swarmctl.ops.orders import obstacle_list
 
     return _change(run, as_json, lambda known: obstacle_list.moved(known, number, center, velocity))
 
@@ -81,7 +81,7 @@ def obstacle_remove(
     as_json: AsJson = False,
 ) -> int:
     """Remove obstacles from a running launch. The numbers of the others stay."""
-    from swarmctl.ops import obstacle_list
+    from swarmctl.ops.orders import obstacle_list
 
     return _change(run, as_json, lambda known: obstacle_list.removed(known, numbers))
 
@@ -94,7 +94,7 @@ def obstacle_load(
     as_json: AsJson = False,
 ) -> int:
     """Add the obstacles of a file to a running launch, at the places that it says."""
-    from swarmctl.ops import obstacle_list
+    from swarmctl.ops.orders import obstacle_list
 
     obstacles = obstacle_list.read_file(file)
 
@@ -112,7 +112,7 @@ def obstacle_save(
     as_json: AsJson = False,
 ) -> int:
     """Write the obstacles of a running launch, as they are now, to a file that `load` and configurations take."""
-    from swarmctl.ops import obstacle_list, operator
+    from swarmctl.ops.orders import obstacle_list, operator
 
     known = obstacle_list.read_obstacles(operator.find_launch(run))
     obstacle_list.write_file(file, known)
@@ -121,14 +121,14 @@ def obstacle_save(
 
 
 def _change(run: str | None, as_json: bool, change: Callable[[ObstaclesMessage], Sequence[ListedObstacle]]) -> int:
-    from swarmctl.ops import obstacle_list, operator
+    from swarmctl.ops.orders import obstacle_list, operator
 
     launch = operator.find_launch(run)
     return _show(launch.run, obstacle_list.change_obstacles(launch, change), as_json)
 
 
 def _show(run: str, known: ObstaclesMessage, as_json: bool) -> int:
-    from swarmctl.ops import obstacle_list
+    from swarmctl.ops.orders import obstacle_list
 
     if as_json:
         print(obstacle_list.as_json(known))

@@ -28,7 +28,7 @@ from swarmctl.core.operator_verbs import (
 from swarmctl.errors import EXIT_OK, ConfigError, MissionError
 
 if TYPE_CHECKING:
-    from swarmctl.ops.order_delivery import Reply
+    from swarmctl.ops.orders.order_delivery import Reply
 
 Run = Annotated[
     str | None,
@@ -70,8 +70,8 @@ def _argument_of(verb: str, name: str) -> VerbArgument:
 
 
 def _give(order: Order, run: str | None, agents: list[int], as_json: bool) -> int:
-    from swarmctl.ops import operator
-    from swarmctl.ops.order_delivery import deliver
+    from swarmctl.ops.orders import operator
+    from swarmctl.ops.orders.order_delivery import deliver
 
     launch = operator.find_launch(run)
     return told(order.verb, launch.run, lambda: deliver(launch, order, agents), as_json=as_json)
@@ -139,7 +139,7 @@ def _goto(
     run: Run = None,
     as_json: AsJson = False,
 ) -> int:
-    from swarmctl.ops import operator
+    from swarmctl.ops.orders import operator
 
     problems: list[str] = []
     arguments = dict(zip(POINT, operator.vector("N,E,D", point, problems), strict=True))

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
-from swarmctl.core.records import TRUTH_COLUMNS
-from swarmctl.core.stored_column import StoredColumn
-from swarmctl.core.tick_record import COLUMNS
+from swarmctl.core.recorded.records import TRUTH_COLUMNS
+from swarmctl.core.recorded.stored_column import StoredColumn
+from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Array
 from swarmctl.errors import StartError
 from swarmctl.files import replaced

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from swarmctl.bus.json_messages import ObstaclesMessage, decode_obstacles, encode_message
+from swarmctl.bus.messages.json_messages import ObstaclesMessage, decode_obstacles, encode_message
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 from swarmctl.telemetry.recording.run_files import utc_us_of
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, plan_rows
+from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, plan_rows
 from swarmctl.core.types import Plan
 from swarmctl.telemetry.json_safe import to_json
 

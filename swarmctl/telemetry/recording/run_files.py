@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
-from swarmctl.core.records import PLAN_COLUMNS, TICK_DTYPE, TRUTH_COLUMNS
-from swarmctl.core.stored_column import StoredColumn, dtype_of
+from swarmctl.core.recorded.records import PLAN_COLUMNS, TICK_DTYPE, TRUTH_COLUMNS
+from swarmctl.core.recorded.stored_column import StoredColumn, dtype_of
+from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.text import printable
-from swarmctl.core.tick_record import COLUMNS
 from swarmctl.errors import ConfigError
 from swarmctl.files import read_file, replaced
 from swarmctl.telemetry.evaluation.referee import RunData

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
-from swarmctl.core.stored_column import StoredColumn
+from swarmctl.core.recorded.stored_column import StoredColumn
 
 if TYPE_CHECKING:
     import pyarrow as pa  # imported in functions, to keep it out of agent processes

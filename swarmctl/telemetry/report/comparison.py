@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from swarmctl.core.recorded.tick_record import CURVES, Curve
 from swarmctl.core.text import told_apart
-from swarmctl.core.tick_record import CURVES, Curve
 from swarmctl.core.types import Array
 from swarmctl.files import replace_text
 from swarmctl.telemetry.evaluation.referee import Rules, RunData

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.closest_pair import closest_pair_m
-from swarmctl.core.tick_record import CURVES, NOT_RECORDED, Curve
+from swarmctl.core.recorded.tick_record import CURVES, NOT_RECORDED, Curve
 from swarmctl.core.types import Array, ControlMode, Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunData

@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from swarmctl.core.tick_record import CURVES
+from swarmctl.core.recorded.tick_record import CURVES
 from swarmctl.core.types import Array, Phase
 from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
 from swarmctl.telemetry.palette import REFERENCE_RGB, SPARE_RGB, agent_rgb

@@ -8,7 +8,7 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from swarmctl.core.tick_record import CURVES, Curve
+from swarmctl.core.recorded.tick_record import CURVES, Curve
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 TIMELINE = "flight_time"

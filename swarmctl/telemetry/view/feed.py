@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import decode_obstacles
-from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.messages.json_messages import decode_obstacles
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.records import unpack_tick
+from swarmctl.core.recorded.records import unpack_tick
 from swarmctl.core.types import Array
 
 

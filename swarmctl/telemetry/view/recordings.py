@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.core.records import NO_POINTS
+from swarmctl.core.recorded.records import NO_POINTS
 from swarmctl.core.types import Array
 from swarmctl.errors import StartError
 from swarmctl.files import replaced_by_program

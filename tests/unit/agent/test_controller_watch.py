@@ -10,7 +10,7 @@ import numpy as np
 
 from swarmctl.agent.watches.controller_watch import ControllerWatch
 from swarmctl.core.types import Phase, Plan, PlanStatus
-from swarmctl.ops.summary import summary_lines
+from swarmctl.ops.flight.summary import summary_lines
 from swarmctl.telemetry.evaluation.run_counts import own_controllers
 
 BUILT_IN = Plan(

@@ -11,10 +11,11 @@ import pytest
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
-from swarmctl.bus.commitment_messages import decode_trajectory_message, encode_trajectory_message
-from swarmctl.bus.json_messages import encode_message
-from swarmctl.bus.path_messages import encode_path
-from swarmctl.bus.peers import LocalBus, LocalHub, agent_name
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.local.hub import LocalBus, LocalHub
+from swarmctl.bus.messages.commitment_messages import decode_trajectory_message, encode_trajectory_message
+from swarmctl.bus.messages.json_messages import encode_message
+from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference

@@ -9,7 +9,7 @@ import pytest
 
 from swarmctl.agent.components import SEPARATION_MODES
 from swarmctl.agent.planning.separation_policy import BestEffort, Guaranteed, SeparationInputs, SeparationPolicy
-from swarmctl.bus.peers import LocalBus
+from swarmctl.bus.local.hub import LocalBus
 from swarmctl.control.collision.separation import KeepOuts, SeparationParams
 from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.core.types import Phase

@@ -12,7 +12,9 @@ import pytest
 
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import (
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.local.hub import LocalHub
+from swarmctl.bus.messages.json_messages import (
     MAX_OBSTACLES,
     MAX_VERSION_STEP,
     CommandMessage,
@@ -20,8 +22,7 @@ from swarmctl.bus.json_messages import (
     encode_message,
     first_list,
 )
-from swarmctl.bus.path_messages import encode_path
-from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.obstacle import Obstacle

@@ -15,7 +15,7 @@ from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.config import load, own_identity
 from swarmctl.errors import ConfigError
 from swarmctl.files import create_private
-from swarmctl.ops.host import (
+from swarmctl.ops.flight.host import (
     add_host_identity,
     load_host,
     make_host_identities,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from swarmctl.bus.json_messages import CommandMessage, decode_command, encode_message
+from swarmctl.bus.messages.json_messages import CommandMessage, decode_command, encode_message
 from swarmctl.bus.orders import EVERYBODY, MAX_LEAD_US, VALID_US, Orders, order_messages
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import OPERATOR

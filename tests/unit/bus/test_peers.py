@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarmctl.bus.links import Impairments
-from swarmctl.bus.path_messages import encode_path
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.local.hub import LEASE_US, LocalBus, LocalHub
+from swarmctl.bus.local.links import Impairments
+from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import LEASE_US, LocalBus, LocalHub, PeerPaths, agent_name
+from swarmctl.bus.peers import PeerPaths
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Presence
 from swarmctl.bus.topics import COMMAND, PATH, TICK, TOO_LONG

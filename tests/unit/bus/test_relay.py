@@ -7,7 +7,8 @@ import struct
 import numpy as np
 import pytest
 
-from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.relay import RelayingBus, decode_relay, encode_relay, missed_by_peers
 from swarmctl.bus.topics import PATH, RELAY, TOO_LONG, TRAJECTORY
 from swarmctl.core.clock import SimClock

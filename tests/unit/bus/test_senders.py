@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from swarmctl.bus.peers import LocalBus, LocalHub
+from swarmctl.bus.local.hub import LocalBus, LocalHub
 from swarmctl.bus.refusals import HARMLESS, Refusals
 from swarmctl.bus.senders import SILENCE_US, Presence, ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.core.clock import SimClock

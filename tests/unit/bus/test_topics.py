@@ -13,9 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmctl.bus import path_messages, topics
-from swarmctl.bus.commitment_messages import MAX_PEERS, MAX_POINTS, encode_trajectory_message
-from swarmctl.bus.json_messages import (
+from swarmctl.bus import topics
+from swarmctl.bus.messages import path_messages
+from swarmctl.bus.messages.commitment_messages import MAX_PEERS, MAX_POINTS, encode_trajectory_message
+from swarmctl.bus.messages.json_messages import (
     MAX_OBSTACLES,
     MAX_REASON,
     AnswerMessage,
@@ -28,10 +29,10 @@ from swarmctl.bus.json_messages import (
     encode_message,
     first_list,
 )
-from swarmctl.bus.path_messages import decode_path, encode_path
+from swarmctl.bus.messages.path_messages import decode_path, encode_path
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order, VerbArgument
-from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Exclusions, Proposal
 from swarmctl.core.types import MAX_MARGIN_M, PredictedPath

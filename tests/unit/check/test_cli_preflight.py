@@ -13,17 +13,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from swarmctl.bus.json_messages import StatusMessage
+from swarmctl.bus.messages.json_messages import StatusMessage
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config, dump, load
-from swarmctl.config_view import viewed_flight
+from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError, SwarmError
-from swarmctl.ops import operator, preflight
-from swarmctl.ops.fault import inject, parse_fault
-from swarmctl.ops.launch_result import why_it_failed
-from swarmctl.ops.processes import RunContext, agent_commands, sitl_command, viewer_command
-from swarmctl.ops.status_table import (
+from swarmctl.ops.flight import preflight
+from swarmctl.ops.flight.launch_result import why_it_failed
+from swarmctl.ops.flight.processes import RunContext, agent_commands, sitl_command, viewer_command
+from swarmctl.ops.flight.summary import summary_lines, violation_lines
+from swarmctl.ops.orders import operator
+from swarmctl.ops.orders.fault import inject, parse_fault
+from swarmctl.ops.supervision.status_table import (
     AgentView,
     LiveTable,
     PlainLines,
@@ -32,7 +34,6 @@ from swarmctl.ops.status_table import (
     status_cells,
     status_table,
 )
-from swarmctl.ops.summary import summary_lines, violation_lines
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 from tests import builders

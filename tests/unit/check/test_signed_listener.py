@@ -24,7 +24,7 @@ from swarmctl.mavlink.signing.channel import CHECK_LINK, SigningChannel
 from swarmctl.mavlink.signing.recognition import SignedRecognition
 from swarmctl.mavlink.signing.signature import SigningKey, is_signed
 from swarmctl.mavlink.transport import pipe_pair
-from swarmctl.ops.key_install import Installation
+from swarmctl.ops.vehicles.key_install import Installation
 from swarmctl.simulator_config import SimulatorConfig
 
 VEHICLE = ("10.0.0.1", 14580)

@@ -20,10 +20,10 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.kinds.identify import IdentifyParams
 from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
-from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.types import Array, Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.ops.identify import _write, identification, table
+from swarmctl.ops.vehicles.identify import _write, identification, table
 
 TRUTH = VehicleModelParams(
     delay_s=0.072, attitude_rad_s=9.0, attitude_damping=0.9, drag_1_s=0.6, hover_thrust_01=0.42, tilt_max_rad=0.7

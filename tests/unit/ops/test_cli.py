@@ -22,8 +22,9 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import MISSION, OPERATOR_VERBS, Answer, OperatorVerb, Order, VerbArgument
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, MissionError, StartError, exit_code_of
-from swarmctl.ops import cli, obstacle_list, operator
-from swarmctl.ops.order_delivery import Reply
+from swarmctl.ops import cli
+from swarmctl.ops.orders import obstacle_list, operator
+from swarmctl.ops.orders.order_delivery import Reply
 from swarmctl.ops.verbs import orders
 
 Run = Callable[..., int]
@@ -312,7 +313,7 @@ def test_options_override_sets_and_simulate_passes_everything_on(run: Run, monke
 
 def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
     code = (
-        "import sys; from swarmctl.ops import cli, status_table\n"
+        "import sys; from swarmctl.ops import cli\nfrom swarmctl.ops.supervision import status_table\n"
         "cli._run_app = lambda: status_table.PlainLines(sys.stdout).print_line('landed') or 4\ncli.main()"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)

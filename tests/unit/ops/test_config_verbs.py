@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from swarmctl.config import Config, load, load_mission
-from swarmctl.config_problems import all_keys
+from swarmctl.configuration.problems import all_keys
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops import config_help
 

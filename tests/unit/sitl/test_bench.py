@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from rich.console import Console
 from scipy import optimize
 
-from sitl.studies.bench import bench, command, formation
+from sitl.studies.bench import bench, command, formation, scale, ticks
 from sitl.studies.bench.captured import Captured, capture, circle_with_obstacle, measure_xy, tapped
 from sitl.studies.bench.formation import Formation, Neighbours, formation_config, places_m
 from sitl.studies.bench.slsqp import KEPT_M, NonlinearXy
@@ -25,7 +26,7 @@ SPEED_M_S = formation.RADIUS_M * formation.OMEGA_RAD_S
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without waiting until the agent has caught up."""
-    monkeypatch.setattr(bench, "_WARM_UP_S", 0.1)
+    monkeypatch.setattr(ticks, "_WARM_UP_S", 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +38,10 @@ def captured() -> Captured:
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("guaranteed", [False, True])
 def test_parts_of_a_tick_add_up_to_it(guaranteed: bool) -> None:
-    measure = bench.measure_commitments if guaranteed else bench.measure_ticks
+    measure = ticks.measure_commitments if guaranteed else ticks.measure_ticks
     parts = measure(2, ["osqp"], 10)["osqp"]
-    assert parts.shape == (10, len(bench.PARTS))
-    commitment = bench.PARTS.index("commitment")
+    assert parts.shape == (10, len(ticks.PARTS))
+    commitment = ticks.PARTS.index("commitment")
     assert (np.delete(parts, commitment, axis=1) > 0.0).all()
     assert (parts[:, commitment] > 0.0).all() == guaranteed
     np.testing.assert_allclose(parts[:, :-1].sum(axis=1), parts[:, -1], atol=1e-6)
@@ -50,7 +51,7 @@ def test_parts_of_a_tick_add_up_to_it(guaranteed: bool) -> None:
 def test_a_tick_without_a_plan_is_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Formation, "planned", property(lambda self: False))
     with pytest.raises(MissionError, match="daqp with 1 neighbours: a tick without a plan"):
-        bench.measure_ticks(1, ["daqp"], 3)
+        ticks.measure_ticks(1, ["daqp"], 3)
 
 
 @pytest.mark.parametrize(
@@ -262,10 +263,41 @@ def test_the_tables_fit_80_columns_with_their_units() -> None:
     rows = [
         bench.BenchRow(name=part + suffix, solver=solver, neighbours=count, p50_ms=12.34, p99_ms=1234.56)
         for suffix, solver, count in cases
-        for part in bench.PARTS
+        for part in ticks.PARTS
     ]
     shown = io.StringIO()
     bench.show(rows, Console(file=shown, width=80))
     assert "\u2026" not in shown.getvalue(), "nothing is cut"
     assert shown.getvalue().count("12.34 (1234.56)") == len(rows)
     assert shown.getvalue().count("[ms]") == 2
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.7, 1.0])
+def test_the_exponent_of_a_power_is_found_whatever_zero_and_one_cost(exponent: float) -> None:
+    counts = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0])
+    costs = 3.0 * np.maximum(counts, 1.0) ** exponent
+    costs[:2] = 100.0
+    assert scale.exponent_of(counts, costs) == pytest.approx(exponent, abs=1e-9)
+    assert np.isnan(scale.exponent_of(counts[:3], costs[:3])), "two counts are needed"
+
+
+@pytest.mark.usefixtures("quick")
+def test_growth_is_measured_written_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = command.main(["--scale", "--neighbours", "1,2,4", "--agents", "2,4", "--ticks", "8", "--out", str(tmp_path)])
+    assert code == 0
+    rows = json.loads((tmp_path / "scale.json").read_text())
+    assert [(row["question"], row["count"]) for row in rows] == [
+        *(("neighbours", count) for count in (1, 2, 4)),
+        *(("agents", count) for count in (2, 4)),
+    ]
+    assert all(0.0 < row["tick_p50_ms"] <= row["tick_p99_ms"] for row in rows)
+    assert all(row["agent_s_per_core_s"] > 0.0 and row["bytes_per_agent_s"] > 1000.0 for row in rows[3:])
+    said = capsys.readouterr().out
+    assert said.count("exponent") == 4 and "scale.html" in said
+    assert (tmp_path / "scale.html").read_text().count("<svg") >= 4
+
+
+def test_growth_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="can't be written"):
+        scale.write([], tmp_path / "file")

@@ -21,7 +21,8 @@ from sitl.studies.campaign.store import Store
 from sitl.studies.campaign.trials import SCHEMA, Cell, Row, Trial, cells
 from sitl.studies.campaign.worker_pool import on_cluster, on_this_machine
 from swarmctl.bus import topics
-from swarmctl.bus.peers import LEASE_US, LocalHub, agent_name
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.local.hub import LEASE_US, LocalHub
 from swarmctl.config import load
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.obstacle import Obstacle

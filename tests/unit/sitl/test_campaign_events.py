@@ -9,7 +9,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.events import Freeze, ScenarioEvent, Split
-from swarmctl.bus.peers import agent_name
+from swarmctl.bus.bus import agent_name
 from swarmctl.bus.topics import OPERATOR
 from swarmctl.config import load
 

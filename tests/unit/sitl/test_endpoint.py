@@ -15,7 +15,7 @@ from sitl.plant.sensors import local_origin
 from sitl.px4.link.schedule import OFFBOARD_HZ, Schedule
 from sitl.px4.parameters import int_from_wire, int_to_wire
 from sitl.world import SitlWorld
-from swarmctl.config_problems import validated
+from swarmctl.configuration.problems import validated
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import GeoOrigin
 from swarmctl.errors import ConfigError

@@ -14,7 +14,7 @@ from sitl import realtime
 from sitl.__main__ import main
 from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
-from swarmctl.core.records import TRUTH_DTYPE
+from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.process_lifetime import StopRequest

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from swarmctl.config import load
-from swarmctl.core.records import TRUTH_DTYPE
+from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.core.types import Array
-from swarmctl.ops.summary import summary_lines
+from swarmctl.ops.flight.summary import summary_lines
 from swarmctl.telemetry.evaluation.arrivals import reached_goals
 from swarmctl.telemetry.evaluation.referee import Rules, evaluate
 from swarmctl.telemetry.json_safe import to_json

@@ -18,9 +18,9 @@ import pytest
 
 from swarmctl.api.run import load_run
 from swarmctl.config import Config, dump, load
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.errors import ConfigError
-from swarmctl.ops.summary import rewrite_report
+from swarmctl.ops.flight.summary import rewrite_report
 from swarmctl.telemetry.recording.run_folder import create_run_folder
 from tests.unit.telemetry.test_run_folder import write_finished_run
 

@@ -15,11 +15,11 @@ from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 
 from swarmctl.api.run import load_run
-from swarmctl.bus.json_messages import first_list
+from swarmctl.bus.messages.json_messages import first_list
 from swarmctl.config import Config, dump
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.records import TICK_DTYPE
-from swarmctl.core.tick_record import COLUMNS
+from swarmctl.core.recorded.records import TICK_DTYPE
+from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.export import export_mcap

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarmctl.core.records import TICK_DTYPE, tick_row
+from swarmctl.core.recorded.records import TICK_DTYPE, tick_row
 from swarmctl.core.types import Plan
 from swarmctl.telemetry.recording import recorder as recorder_module
 from swarmctl.telemetry.recording.recorder import Recorder

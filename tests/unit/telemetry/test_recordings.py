@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from swarmctl import __version__
 from swarmctl.core.frames import euler_from_quat, quat_from_euler
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
-from swarmctl.core.tick_record import COLUMNS
+from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import ControlMode, Mode, Phase
 from swarmctl.errors import StartError
 from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad

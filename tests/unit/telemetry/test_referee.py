@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from swarmctl.core.flight_volume import FlightVolume, VolumeParams
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunData, evaluate
 from swarmctl.telemetry.evaluation.tracks import track_error

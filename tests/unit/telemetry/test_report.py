@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from swarmctl.config import Config, dump, load_recorded
-from swarmctl.core.tick_record import CURVES
+from swarmctl.core.recorded.tick_record import CURVES
 from swarmctl.core.types import ControlMode, Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.verbs.folders import report

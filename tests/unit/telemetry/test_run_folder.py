@@ -14,11 +14,11 @@ import pytest
 from numpy.typing import NDArray
 
 from swarmctl import __version__
-from swarmctl.bus.json_messages import first_list
+from swarmctl.bus.messages.json_messages import first_list
 from swarmctl.config import Config, dump
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
-from swarmctl.core.tick_record import COLUMNS
+from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
+from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import ControlMode, FlightMode, Mode, Phase, PlanStatus
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.palette import LIMIT_RGB, REFERENCE_RGB, agent_rgb

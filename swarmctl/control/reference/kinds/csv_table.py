@@ -1,7 +1,7 @@
 """References read from CSV files: points at times, or polynomials as crazyswarm2 writes them.
 
-The files are read when a configuration is loaded (`swarmctl/config_tables.py`), which puts what they hold beside their
-names; this module knows tables only.
+The files are read when a configuration is loaded (`swarmctl/configuration/tables.py`), which puts what they hold beside
+their names; this module knows tables only.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """References of a drone show in Skybrush's compiled format: each agent flies the trajectory of one drone.
 
-The file is read when a configuration is loaded (`swarmctl/config_shows.py`), which puts the trajectories beside its
-name; this module knows those only. A trajectory is a list of points at times, with the control points of the Bezier
+The file is read when a configuration is loaded (`swarmctl/configuration/shows.py`), which puts the trajectories beside
+its name; this module knows those only. A trajectory is a list of points at times, with the control points of the Bezier
 curve that leads there from the point before: none for a straight line, two for a cubic curve.
 """
 

@@ -1,0 +1,228 @@
+"""`bench --scale`: how costs grow with the number of neighbours and of agents, with the fitted exponents and a plot.
+
+Two questions, each with counts of its own:
+
+- neighbours: the tick of one agent that has a row in its problem for each of them, as in `bench`;
+- agents: a whole swarm in lockstep, hovering 3 m apart, where each agent has rows for its nearest only
+  (`separation.max_neighbours`) but hears everybody. Processor time counts all of it, the simulator included; bytes are
+  what an agent gives to its bus.
+
+An exponent is that of cost = a * count ** exponent, by least squares in logarithms: 0 is flat, 1 is linear.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.table import Table
+
+from sitl.lockstep import Lockstep
+from sitl.studies.bench.captured import settled_garbage
+from sitl.studies.bench.ticks import get_under_way, measure_ticks, tracks
+from swarmctl.config import Config, load
+from swarmctl.core.types import Array
+from swarmctl.errors import ConfigError
+from swarmctl.files import replace_text
+from swarmctl.telemetry.report.charts import Line, agent_line, reference_line, time_chart
+from swarmctl.telemetry.report.pages import render
+
+_SPACING_M = 3.0
+_HEIGHT_M = 3.0
+_ENDLESS_S = 3600.0
+_SETTLE_STEPS = 50  # after the last agent has begun to track
+_SMALLEST = 2  # counts of an exponent: 0 has no logarithm, and 1 says nothing yet
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScaleRow:
+    """One line of `scale.json`; what a question does not ask is None."""
+
+    question: str  # "neighbours" or "agents"
+    solver: str
+    count: int
+    tick_p50_ms: float  # of one agent
+    tick_p99_ms: float
+    agent_s_per_core_s: float | None = None  # flown seconds of agents in one second of a processor
+    bytes_per_agent_s: float | None = None  # published on the bus
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Growth:
+    """A cost over a count, and what was fitted to it."""
+
+    title: str
+    counts: Array  # (K,)
+    costs: Array  # (K,)
+    exponent: float  # NaN with fewer than two counts
+
+    @property
+    def words(self) -> str:
+        """The growth in words."""
+        if math.isnan(self.exponent):
+            return self.title
+        return f"{self.title}: exponent {self.exponent:.2f}, twice as many cost {2.0**self.exponent:.2f} times as much"
+
+
+def neighbour_rows(counts: Sequence[int], solver: str, ticks: int, on_count: Callable[[], None]) -> list[ScaleRow]:
+    """Measure the tick of one agent among so many neighbours, for each count."""
+    rows = []
+    for count in counts:
+        tick_ms = measure_ticks(count, [solver], ticks)[solver][:, -1]
+        rows.append(_row("neighbours", solver, count, tick_ms))
+        on_count()
+    return rows
+
+
+def agent_rows(counts: Sequence[int], solver: str, ticks: int, on_count: Callable[[], None]) -> list[ScaleRow]:
+    """Measure swarms of so many agents in lockstep, each for at least `ticks` ticks of agents."""
+    rows = []
+    for count in counts:
+        rows.append(_swarm_row(count, solver, ticks))
+        on_count()
+    return rows
+
+
+def _swarm_row(count: int, solver: str, ticks: int) -> ScaleRow:
+    config = _hovering(count, solver)
+    flight = Lockstep(config)
+    get_under_way(solver, flight.step, lambda: all(tracks(flight, agent) for agent in range(count)))
+    for _ in range(_SETTLE_STEPS):
+        flight.step()
+    sent_before, steps, tick_ms = _sent_bytes(flight), math.ceil(ticks / count), list[float]()
+    with settled_garbage():
+        began_s = time.process_time()
+        for _ in range(steps):
+            flight.step()
+            tick_ms += [agent.timing.tick_ms for agent in flight.agents if agent is not None]
+        spent_s = time.process_time() - began_s
+    flown_s = steps * count / config.agent.rate_hz
+    bytes_s = (_sent_bytes(flight) - sent_before) / flown_s
+    return _row("agents", solver, count, np.array(tick_ms), agent_s_per_core_s=flown_s / spent_s, bytes_s=bytes_s)
+
+
+def _row(
+    question: str,
+    solver: str,
+    count: int,
+    tick_ms: Array,
+    *,
+    agent_s_per_core_s: float | None = None,
+    bytes_s: float | None = None,
+) -> ScaleRow:
+    return ScaleRow(
+        question=question,
+        solver=solver,
+        count=count,
+        tick_p50_ms=round(float(np.percentile(tick_ms, 50)), 4),
+        tick_p99_ms=round(float(np.percentile(tick_ms, 99)), 4),
+        agent_s_per_core_s=None if agent_s_per_core_s is None else round(agent_s_per_core_s, 3),
+        bytes_per_agent_s=None if bytes_s is None else round(bytes_s, 1),
+    )
+
+
+def _hovering(count: int, solver: str) -> Config:
+    """Return a square of agents that hover above their starts."""
+    side = math.ceil(math.sqrt(count))
+    places = [[_SPACING_M * (k % side), _SPACING_M * (k // side), -_HEIGHT_M] for k in range(count)]
+    return load(
+        None,
+        [
+            f"swarm.agents={count}",
+            f"start.positions_ned_m={places}",
+            "mission.kind=hover",
+            f"mission.duration_s={_ENDLESS_S}",
+            f"controller.mpc.qp.solver='{solver}'",
+            "sitl.start='air'",
+        ],
+    )
+
+
+def _sent_bytes(flight: Lockstep) -> int:
+    return sum(topic["bytes"] for agent in flight.agents if agent is not None for topic in agent.sent.values())
+
+
+def growths(rows: Sequence[ScaleRow]) -> list[Growth]:
+    """Return every cost over its count, with its exponent."""
+    near = [row for row in rows if row.question == "neighbours"]
+    swarm = [row for row in rows if row.question == "agents"]
+    found = [
+        _growth("tick over neighbours [ms]", near, [row.tick_p50_ms for row in near]),
+        _growth("tick over agents [ms]", swarm, [row.tick_p50_ms for row in swarm]),
+        _growth(
+            "processor time for a second of one agent, over agents [s]",
+            swarm,
+            [1.0 / row.agent_s_per_core_s for row in swarm if row.agent_s_per_core_s],
+        ),
+        _growth(
+            "bytes published by one agent, over agents [1/s]",
+            swarm,
+            [row.bytes_per_agent_s for row in swarm if row.bytes_per_agent_s is not None],
+        ),
+    ]
+    return [growth for growth in found if len(growth.counts)]
+
+
+def _growth(title: str, rows: Sequence[ScaleRow], costs: Sequence[float]) -> Growth:
+    counts = np.array([row.count for row in rows], np.float64)
+    return Growth(title=title, counts=counts, costs=np.array(costs), exponent=exponent_of(counts, np.array(costs)))
+
+
+def exponent_of(counts: Array, costs: Array) -> float:
+    """Return e of costs (K,) = a * counts (K,) ** e by least squares in logarithms; NaN with fewer than two counts."""
+    fitted = counts >= _SMALLEST
+    if np.count_nonzero(fitted) < 2:
+        return math.nan
+    x, y = np.log(counts[fitted]), np.log(costs[fitted])
+    return float(np.sum((x - x.mean()) * (y - y.mean())) / np.sum((x - x.mean()) ** 2))
+
+
+def write(rows: Sequence[ScaleRow], directory: Path) -> list[Path]:
+    """Write `scale.json` and `scale.html` to `directory`, which is made if necessary, and return their paths.
+
+    Raises:
+        ConfigError: it can't be written.
+    """
+    written = [directory / "scale.json", directory / "scale.html"]
+    charts = [_chart(growth) for growth in growths(rows)]
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        replace_text(written[0], json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+        replace_text(written[1], render(__package__, "scale.html", rows=rows, charts=charts))
+    except OSError as error:
+        raise ConfigError("--out", [f"{directory}: can't be written: {error.strerror}"]) from error
+    return written
+
+
+def _chart(growth: Growth) -> Markup:
+    lines: list[Line] = [agent_line(0, growth.counts, growth.costs, label="measured", marks=True)]
+    fitted = growth.counts >= _SMALLEST
+    if math.isfinite(growth.exponent):
+        counts, costs = growth.counts[fitted], growth.costs[fitted]
+        scale = math.exp(float(np.mean(np.log(costs) - growth.exponent * np.log(counts))))
+        lines.append(reference_line(counts, scale * counts**growth.exponent, label="fitted"))
+    shown = (0.0, float(growth.counts.max()) * 1.02)
+    return time_chart(growth.words, lines, shown, from_zero=True, x_unit="")
+
+
+def show(rows: Sequence[ScaleRow], console: Console) -> None:
+    """Print the rows and what grows how."""
+    table = Table("count", "tick p50 (p99) [ms]", "agent-s per core-s", "bytes per agent [1/s]", box=SIMPLE)
+    for row in rows:
+        table.add_row(
+            f"{row.count} {row.question}",
+            f"{row.tick_p50_ms:.2f} ({row.tick_p99_ms:.2f})",
+            "" if row.agent_s_per_core_s is None else f"{row.agent_s_per_core_s:.1f}",
+            "" if row.bytes_per_agent_s is None else f"{row.bytes_per_agent_s:.0f}",
+        )
+    console.print(table)
+    for growth in growths(rows):
+        console.print(growth.words, markup=False, highlight=False)

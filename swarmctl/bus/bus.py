@@ -1,0 +1,54 @@
+"""The bus as one protocol, and the names of those on it. Pure: no Zenoh, no clock, no thread."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Protocol
+
+from swarmctl.bus.refusals import RefusedMessage
+from swarmctl.bus.topics import Topic
+
+Subscriptions = Mapping[Topic, Sequence[str] | None]  # senders to receive per topic; None: all but oneself
+
+
+def agent_name(agent: int) -> str:
+    """Return the sender name of an agent on the bus."""
+    return f"agent-{agent}"
+
+
+class Bus(Protocol):
+    """Publishes to all subscribers and receives without blocking."""
+
+    def publish(self, topic: Topic, payload: bytes) -> None:
+        """Send to all subscribers; a message is dropped rather than queued for long."""
+
+    def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
+        """Return (sender, payload) of the messages since the last call, oldest first for each sender.
+
+        There is at most one ring of each sender, and `TOO_LONG` replaces a message that is too long for its topic.
+        """
+
+    def refused(self) -> list[RefusedMessage]:
+        """Return the messages that were not delivered since the last call; only sealed ones are refused by a bus."""
+        return []
+
+    def relay(self, agents: Iterable[int]) -> int:
+        """Pass on the newest trajectory messages of other agents, by `RelayingBus` only; return the number of bytes."""
+        return 0
+
+    def alive(self) -> frozenset[str]:
+        """Return senders attached now, this one included. It shows that a process lives, not that its loop runs."""
+
+    def arrivals(self) -> Mapping[str, int]:
+        """Return how often each sender has joined, so that one that left and rejoined at once is noticed."""
+
+    def reopen(self) -> bool:
+        """Open another session in place of this one, which may be deaf; return whether one is being opened."""
+        return False
+
+    def reopened(self) -> int:
+        """Return how often another session has taken the place of a deaf one."""
+        return 0
+
+    def close(self) -> None:
+        """Leave the bus."""

@@ -1,0 +1,184 @@
+"""Constraints between sections of a configuration: what is wrong with keys that are each right by themselves."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+
+from swarmctl.bus.network.hosts import HostParams
+from swarmctl.configuration.sections import LimitParams, SitlParams, VehicleParams
+from swarmctl.control.collision.barrier import BarrierParams
+from swarmctl.control.collision.separation import SeparationParams, radius_problem
+from swarmctl.control.controllers.discovery import ControllerParams
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.core.flight_volume import VolumeParams
+from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.params import FARTHEST_M
+from swarmctl.mavlink.geofence import GeofenceParams, is_inside
+from swarmctl.mavlink.transport import Endpoint, parse_url
+
+_PAIRS_SHOWN = 3
+
+
+def own_controller_problems(
+    controller: ControllerParams, separation: SeparationParams, barrier: BarrierParams
+) -> Iterator[str]:
+    """Yield why an own controller is not flown."""
+    if controller.is_own and not barrier.enabled:
+        yield "agent.barrier.enabled = false: an own controller flies behind the safety filter only; set it to true"
+    if controller.is_own and separation.mode == "guaranteed":
+        yield (
+            f"controller.kind = {controller.kind!r} with separation.mode = 'guaranteed': commitments are tracked"
+            " by built-in controllers; set separation.mode = 'best_effort'"
+        )
+
+
+def separation_problems(
+    separation: SeparationParams, model: VehicleModelParams, limits: LimitParams, agents: int, drift_m: float
+) -> Iterator[str]:
+    """Yield which distances do not suffice, or can't be known."""
+    if agents > 1 and (problem := radius_problem(separation, 0.0, drift_m)):
+        yield problem
+    if separation.gust_m_s and not model.drag_1_s:
+        yield (
+            f"separation.gust_m_s = {separation.gust_m_s:g}: what a gust does to a vehicle follows from its "
+            "drag; set vehicle_model.drag_1_s (swarmctl check --identify measures it)"
+        )
+    if separation.radius_m < limits.min_separation_m:
+        yield (
+            f"limits.min_separation_m = {limits.min_separation_m}: larger than separation.radius_m = "
+            f"{separation.radius_m}; agents would be judged by more than they keep. Lower it or raise the radius"
+        )
+
+
+def volume_problems(
+    volume: VolumeParams,
+    geofence: GeofenceParams,
+    controller: ControllerParams,
+    separation: SeparationParams,
+    starts_ned_m: Sequence[tuple[float, float, float]],
+    drift_m: float,
+) -> Iterator[str]:
+    """Yield what does not go with the flight volume."""
+    corners, fence = volume.corners_ne_m, geofence.corners_ne_m
+    yield from volume.problems(starts_ned_m, separation.tracking_m + drift_m)
+    if corners and not (controller.keeps_volume or separation.mode == "guaranteed"):
+        yield (
+            f"controller.kind = {controller.kind!r} with a volume: it does not plan, and would fly out of it; "
+            "use dmpc, dmpc3 or mpc"
+        )
+    beyond = [list(corner) for corner in corners if fence and not is_inside(corner, fence)]
+    if beyond:
+        yield f"volume.corners_ne_m: {beyond} are outside of geofence.corners_ne_m; move the corners or the fence"
+
+
+def starts_apart(
+    starts_ned_m: Sequence[tuple[float, float, float]], separation: SeparationParams, sitl: SitlParams
+) -> Iterator[str]:
+    """Yield which start positions are too close together, or in the ground."""
+    pairs = ((math.dist(a, b), i, j) for (i, a), (j, b) in itertools.combinations(enumerate(starts_ned_m), 2))
+    close = sorted(pair for pair in pairs if pair[0] < separation.radius_m)
+    for distance_m, i, j in close[:_PAIRS_SHOWN]:
+        yield (
+            f"start: agents {i} and {j} would wait {distance_m:.2f} m apart; separation.radius_m is "
+            f"{separation.radius_m}. Raise start.spacing_m or move them"
+        )
+    if len(close) > _PAIRS_SHOWN:
+        yield f"start: {len(close) - _PAIRS_SHOWN} more pairs of agents would wait too close together"
+    far = [i for i, start in enumerate(starts_ned_m) if max(map(abs, start)) > FARTHEST_M]
+    if far:
+        yield f"start: agents {far} wait more than {FARTHEST_M:g} m from the shared origin; move them or the origin"
+    if sitl.enabled and sitl.start == "ground":
+        for i, start in enumerate(starts_ned_m):
+            if start[2] > sitl.ground_z_m - 0.5:
+                yield (
+                    f"start: agent {i} waits at z = {start[2]} m, less than 0.5 m above the ground at "
+                    f"sitl.ground_z_m = {sitl.ground_z_m} (NED, down is positive)"
+                )
+
+
+def obstacle_problems(
+    obstacles: Sequence[Obstacle],
+    starts_ned_m: Sequence[Sequence[float]],
+    goals_ned_m: Sequence[Sequence[float] | None],
+) -> Iterator[str]:
+    """Yield which agents would wait in an obstacle, and whose goal is in one that stays where it is."""
+    for i, obstacle in enumerate(obstacles):
+        goals = () if obstacle.moves else goals_ned_m
+        placed = [(f"agent {k} would wait", start) for k, start in enumerate(starts_ned_m)]
+        placed += [(f"the goal of agent {k} is", goal) for k, goal in enumerate(goals) if goal is not None]
+        inside = [(said, at) for said, at in placed if obstacle.distance_m(at) < obstacle.keep_out_m]
+        middle = "axis" if obstacle.column else "centre"
+        for said, at in inside[:_PAIRS_SHOWN]:
+            distance = f"{obstacle.distance_m(at):.2f} m from its {middle}"
+            yield f"obstacles.{i}: {said} {distance}; its keep_out_m is {obstacle.keep_out_m:g}. Move one of them"
+        if len(inside) > _PAIRS_SHOWN:
+            yield f"obstacles.{i}: {len(inside) - _PAIRS_SHOWN} more starts or goals are within its keep_out_m"
+
+
+def vehicle_problems(vehicles: Sequence[VehicleParams], agents: int, *, simulated: bool) -> Iterator[str]:
+    """Yield what is wrong with the list of vehicles to fly."""
+    if not vehicles:
+        if not simulated:
+            yield "vehicles: empty while sitl.enabled = false; list one [[vehicles]] with sysid and url for each agent"
+        return
+    if simulated:
+        yield (
+            "vehicles: listed while sitl.enabled = true; set sitl.enabled = false to fly them, "
+            "or remove them to fly the built-in simulator"
+        )
+    if len(vehicles) < agents:
+        yield f"vehicles: {len(vehicles)} listed for swarm.agents = {agents}; list one for each agent"
+    seen_sysids: dict[int, int] = {}
+    links: list[Endpoint | None] = []
+    for i, vehicle in enumerate(vehicles):
+        try:
+            link = parse_url(vehicle.url)
+        except ValueError as error:
+            yield f"vehicles.{i}.url = {error}"
+            link = None
+        rivals = [k for k, other in enumerate(links) if link and other and _same_place(link, other)]
+        links.append(link)
+        if rivals:
+            yield (
+                f"vehicles.{i}.url = {vehicle.url!r}: same port as vehicles.{rivals[0]}; "
+                "every vehicle needs a link of its own"
+            )
+        if vehicle.sysid in seen_sysids:
+            yield (
+                f"vehicles.{i}.sysid = {vehicle.sysid}: same as vehicles.{seen_sysids[vehicle.sysid]}; "
+                "give every autopilot its own MAV_SYS_ID"
+            )
+        seen_sysids.setdefault(vehicle.sysid, i)
+
+
+def forward_problems(urls: Sequence[str]) -> Iterator[str]:
+    """Yield which ground stations can't be forwarded to."""
+    for i, url in enumerate(urls):
+        try:
+            if parse_url(url).scheme != "udpout":
+                raise ValueError(f"{url!r}: only udpout://HOST:PORT is forwarded to")
+        except ValueError as error:
+            yield f"mavlink.forward.{i} = {error}"
+
+
+def simulated_host_problems(hosts: Sequence[HostParams]) -> Iterator[str]:
+    """Yield which hosts can't simulate the vehicles of their agents."""
+    for i, host in enumerate(hosts):
+        if list(host.agents) != list(range(host.agents[0], host.agents[0] + len(host.agents))):
+            yield (
+                f"hosts.{i}.agents = {list(host.agents)}: a host simulates vehicles that follow one another; "
+                "list numbers without gaps"
+            )
+
+
+def _same_place(a: Endpoint, b: Endpoint) -> bool:
+    """Return whether two links share a serial device, a local port or a remote address."""
+    if a.scheme != b.scheme:
+        return False
+    if a.scheme == "serial":
+        return a.where == b.where
+    if a.scheme == "udpin" and "0.0.0.0" in (a.where, b.where):
+        return a.number == b.number
+    return (a.where, a.number) == (b.where, b.number)

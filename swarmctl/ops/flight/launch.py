@@ -1,0 +1,324 @@
+"""The launcher: runs the preflight, starts the processes, supervises the flight, stops all processes, and sums up.
+
+`swarmctl.ops.supervision` watches the flight, and `swarmctl.ops.flight.preflight` decides whether it may start. In
+every case all processes, sockets and ports that were started here end with this module.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+
+from swarmctl import __version__
+from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.network.joining import join_bus
+from swarmctl.bus.network.router_links import RouterLinks
+from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
+from swarmctl.bus.topics import OBSTACLES, OPERATOR, STATUS, TICK, Topic
+from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, socket_file
+from swarmctl.config import Config, dump
+from swarmctl.configuration.doubts import warning_lines
+from swarmctl.errors import ConfigError, StartError
+from swarmctl.files import replace_text
+from swarmctl.ops.flight.launch_result import LaunchResult
+from swarmctl.ops.flight.preflight import LOOPBACK, ReservedPorts, inspect
+from swarmctl.ops.flight.processes import (
+    ROUTER,
+    Child,
+    Command,
+    RunContext,
+    agent_commands,
+    end_all,
+    router_command,
+    run_name,
+    sitl_command,
+    viewer_command,
+    wants_realtime,
+)
+from swarmctl.ops.flight.summary import sum_up
+from swarmctl.ops.orders.operator import RunningLaunch, announce, list_keepers, process_start_s, utc_us, withdraw
+from swarmctl.ops.supervision.status_table import open_display
+from swarmctl.ops.supervision.supervisor import FlightSupervisor, Services
+from swarmctl.process_lifetime import StopRequest
+from swarmctl.process_priority import is_realtime_permitted
+from swarmctl.telemetry.recording.event_log import EventLog
+
+_BUS_S = 20.0  # timeout for the router to answer
+_BUS_TRY_MS = 500
+_LAND_S = 30.0
+_STOP_S = 10.0  # time for viewer and simulator to write their files
+_ROUTER_STOP_S = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class LaunchOptions:
+    """Options of a launch that are not part of the configuration."""
+
+    run_dir: Path | None = None
+    view: bool = False  # open the viewer window
+    web: bool = False  # serve the view to browsers of this computer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SwarmPart:
+    """The part of a swarm that flies from one computer; all of it where no other one takes part.
+
+    Attributes:
+        run: name of the run on the bus, the same on every computer.
+        agents: numbers of the agents here.
+        links: links of the router to other computers, None without any.
+    """
+
+    run: str
+    agents: tuple[int, ...]
+    links: RouterLinks | None = None
+
+
+def launch(config: Config, options: LaunchOptions) -> int:
+    """Fly a configuration from this computer alone and return the exit code.
+
+    Raises:
+        ConfigError, StartError: it was refused, or did not come up; nothing is left running.
+    """
+    part = SwarmPart(run=run_name(config.name), agents=tuple(range(config.swarm.agents)))
+    return launch_part(config, options, part)
+
+
+def launch_part(config: Config, options: LaunchOptions, part: SwarmPart) -> int:
+    """Fly the agents of this computer and return the exit code.
+
+    Raises:
+        ConfigError, StartError: it was refused, or did not come up; nothing is left running.
+    """
+    with StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stop:
+        with started(config, options, part) as services:
+            result = FlightSupervisor(config, services, services.display).fly(lambda: stop.count)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
+    # From here on Ctrl-C acts as usual: nothing is left to land.
+    return judged(config, services, result)
+
+
+def judged(config: Config, services: Launcher, result: LaunchResult) -> int:
+    """Judge the run folder of services that have stopped; return the exit code. Verbs find the launch until then."""
+    try:
+        violated = sum_up(config, services.context.directory, result, services.display.print_line)
+    finally:
+        withdraw()
+    return result.exit_code(violated)
+
+
+@contextmanager
+def started(config: Config, options: LaunchOptions, part: SwarmPart) -> Iterator[Launcher]:
+    """Start the processes of this computer, and stop them at the end.
+
+    Raises:
+        ConfigError, StartError: it was refused, or did not come up; nothing is left running.
+    """
+    if options.web and not config.telemetry.enabled:
+        raise ConfigError("--web", ["telemetry.enabled = false: there is no view"])
+    reserved = inspect(config, part.agents)
+    try:
+        directory = _run_folder(config, options)
+    except BaseException:
+        reserved.release()
+        raise
+    services = Launcher(config, options, reserved, directory, part=part)
+    try:
+        services.start()
+        yield services
+    except BaseException:
+        services.stop(_LAND_S)  # agents still get time to land
+        withdraw()
+        raise
+    else:
+        services.stop(0.0)  # every agent has ended
+    finally:
+        services.display.close()
+
+
+def _run_folder(config: Config, options: LaunchOptions) -> Path:
+    from swarmctl.telemetry.recording.run_folder import create_run_folder  # heavy
+
+    directory = create_run_folder(options.run_dir, config.name, time.time_ns() // 1000).resolve()
+    try:
+        replace_text(directory / "config.toml", dump(config))
+    except OSError as error:
+        raise StartError(f"{directory}: can't be written: {error}. Choose another with --run-dir") from error
+    return directory
+
+
+class Launcher(Services):
+    """Starts the processes of one launch, and ends them."""
+
+    def __init__(
+        self,
+        config: Config,
+        options: LaunchOptions,
+        reserved: ReservedPorts,
+        directory: Path,
+        *,
+        part: SwarmPart,
+    ) -> None:
+        self._socket_dir = Path(tempfile.mkdtemp(prefix="swarm-"))  # mode 0700
+        self._config = config
+        self._options = options
+        self._reserved = reserved
+        self.display = open_display(run=part.run)
+        identity = None if part.links is None else part.links.identity
+        self.context = RunContext(part.run, f"{SCHEME}{self._socket_dir}/bus.sock", directory, part.agents, identity)
+        self._links = part.links
+        self.log = EventLog(directory / "launch.events.jsonl", "launch")
+        self.children: dict[str, Child] = {}
+        self._announced: RunningLaunch | None = None
+
+    def start(self) -> None:
+        """Start every process and join the bus; later failures are seen by the supervisor.
+
+        Raises:
+            StartError: a program can't be run or the router does not answer.
+        """
+        config, context, reserved = self._config, self.context, self._reserved
+        socket_file(context.endpoint)
+        self._spawn(router_command(config, context, self._links))
+        self.bus = self._join_bus()
+        if reserved.view_port:
+            options = self._options
+            self._spawn(viewer_command(config, context, reserved.view_port, view=options.view, web=options.web))
+        if config.sitl.enabled and context.agents:
+            self._spawn(sitl_command(config, context, reserved.ports, reserved.vehicle_sockets))
+        for command in agent_commands(config, context, reserved.sockets, reserved.vehicle_sockets):
+            self._spawn(command)
+        self.announce("")
+        for line in (*_introduction(config, context, reserved), *warning_lines(config)):
+            self.display.print_line(line)
+        realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
+        self.log.write(
+            "started",
+            run=context.run,
+            version=__version__,
+            agents=list(context.agents),
+            ports=list(reserved.ports),
+            realtime=realtime,
+        )
+
+    @property
+    def joined_bus(self) -> Bus:
+        """Return the bus that `start` has joined.
+
+        Raises:
+            StartError: it has not.
+        """
+        if self.bus is None:
+            raise StartError("the bus is not up")
+        return self.bus
+
+    def restart_router(self) -> None:
+        """Start the router again where the ended one was; everybody's session finds it by itself."""
+        self._spawn(router_command(self._config, self.context, self._links))
+
+    def stop(self, agents_grace_s: float) -> None:
+        """End every process, agents first and the router last, and remove all temporary files. Safe at any point."""
+        router = [child for name, child in self.children.items() if name == ROUTER]
+        agents = [child for name, child in self.children.items() if name.startswith(agent_name(0)[:-1])]
+        others = [child for child in self.children.values() if child not in router + agents]
+        end_all(agents, agents_grace_s)
+        self._announce_end()
+        end_all(others, _STOP_S)
+        if self.bus is not None:
+            self.bus.close()
+        end_all(router, _ROUTER_STOP_S)
+        self._reserved.release()
+        shutil.rmtree(self._socket_dir, ignore_errors=True)
+        self.log.write("stopped", exit_codes={name: child.poll() for name, child in self.children.items()})
+
+    def recover(self, agent: int) -> Child:
+        """Start an agent on the vehicle of an ended one; it records separately and can fly without a router."""
+        router = self.children[ROUTER]
+        endpoint = self.context.endpoint if router.poll() is None else NO_BUS
+        directory = self.context.directory / "recovery"
+        directory.mkdir(exist_ok=True)
+        context = replace(self.context, endpoint=endpoint, directory=directory, agents=(agent,))
+        place = self.context.agents.index(agent)
+        own = slice(place, place + 1)
+        ends = self._reserved.sockets[own], self._reserved.vehicle_sockets[own]
+        config_path = self.context.directory / "config.toml"
+        (command,) = agent_commands(self._config, context, *ends, config_path=config_path)
+        return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
+
+    def announce(self, view: str) -> None:
+        """Publish this launch to the operator's commands."""
+        context = self.context
+        start_s, pid = process_start_s()
+        self._announced = RunningLaunch(
+            context.run,
+            context.endpoint,
+            pid,
+            start_s,
+            self._config.swarm.agents,
+            str(context.directory),
+            view,
+            context.identity,
+            __version__,
+        )
+        announce(self._announced)
+
+    def _announce_end(self) -> None:
+        """Publish that nobody answers any more; that it can't be, without a descriptor left, stops no ending."""
+        if self._announced is not None:
+            with contextlib.suppress(OSError):
+                announce(msgspec.structs.replace(self._announced, ending=True))
+
+    def _spawn(self, command: Command) -> None:
+        self.children[command.name] = Child(command, self.context.directory)
+
+    def _join_bus(self) -> Bus:
+        context = self.context
+        senders = [agent_name(agent) for agent in range(self._config.swarm.agents)]
+        listen: dict[Topic, Sequence[str]] = {STATUS: senders, OBSTACLES: list_keepers(context.identity)}
+        if not context.agents:  # nobody records here, so the station does
+            listen[TICK] = senders
+        router = self.children[ROUTER]
+        deadline_s = time.monotonic() + _BUS_S
+        while True:
+            try:
+                return join_bus(
+                    context.endpoint,
+                    context.run,
+                    OPERATOR if context.identity is None else context.identity.name,
+                    listen,
+                    identity=context.identity,
+                    max_age_us=FOR_OPERATORS_US,
+                    utc_us=utc_us,
+                    lease_ms=self._config.bus.lease_ms,
+                    connect_timeout_ms=_BUS_TRY_MS,
+                )
+            except StartError as error:
+                if router.poll() is not None:
+                    raise StartError(f"router {router.how_it_ended()}; see {router.log}") from error
+                if time.monotonic() > deadline_s:
+                    raise StartError(f"router does not answer within {_BUS_S:.0f} s; see {router.log}") from error
+
+
+def _introduction(config: Config, context: RunContext, reserved: ReservedPorts) -> tuple[str, ...]:
+    """Return three lines that say what runs."""
+    agents = len(context.agents)
+    of = f" of {config.swarm.agents}" if agents < config.swarm.agents else ""
+    if config.sitl.enabled:
+        vehicles = f"built-in SITL ({config.sitl.preset}) on {LOOPBACK}"
+    else:
+        vehicles = ", ".join(config.vehicles[agent].url for agent in context.agents)
+    view = "the view's address follows" if reserved.view_port else "no view"
+    return (
+        f"{context.run}: {agents}{of} agent{'s' if config.swarm.agents > 1 else ''}, {vehicles}",
+        f"bus {context.endpoint}; {view}",
+        f"run folder {context.directory}",
+    )

@@ -1,0 +1,256 @@
+"""The processes of a launch: a table of command lines, and a child process that is started, watched and ended.
+
+Every child has its own session, so that Ctrl-C in the terminal reaches the launcher alone. It writes to
+`DIR/<name>.log`, and the kernel ends it with the launcher.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.network.roster import OwnIdentity
+from swarmctl.bus.network.router_links import RouterLinks
+from swarmctl.bus.zenoh_bus import socket_file
+from swarmctl.config import Config
+from swarmctl.configuration.view import viewed_flight
+from swarmctl.core.text import printable
+from swarmctl.errors import StartError
+from swarmctl.process_lifetime import PARENT_ENV
+
+ROUTER = "router"
+SITL = "sitl"
+VIEWER = "viewer"
+_TAIL_BYTES = 4096
+_AGENTS_PER_PROCESSOR = 2  # more at real-time priority could leave nothing for shells and the launcher itself
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One process to start: its name, its command line, and the file descriptors it inherits."""
+
+    name: str
+    argv: tuple[str, ...]
+    fds: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RunContext:
+    """Values that all command lines of a launch share: run name, bus endpoint, run folder, agents of this computer.
+
+    On a bus of several computers also the identity as which all of them speak.
+    """
+
+    run: str
+    endpoint: str
+    directory: Path
+    agents: tuple[int, ...]
+    identity: OwnIdentity | None = None
+
+
+def run_name(name: str) -> str:
+    """Return a name for one run on the bus that is new every time."""
+    return f"{name}-{secrets.token_hex(4)}"
+
+
+def wants_realtime(config: Config, agents: Sequence[int]) -> bool:
+    """Return whether these agents are to have real-time priority and leave the processors some time for others."""
+    if sys.platform != "linux":
+        return False
+    return config.agent.realtime and len(agents) <= _AGENTS_PER_PROCESSOR * len(os.sched_getaffinity(0))
+
+
+def router_command(config: Config, context: RunContext, links: RouterLinks | None) -> Command:
+    """Return the command of the bus router, with its links to other computers if there are any."""
+    argv = _python("-m", "swarmctl.bus.network.router", context.endpoint, "--die-with-parent")
+    argv += links.arguments() if links is not None else ()
+    return Command(ROUTER, (*argv, _priority_flag(config, context)))
+
+
+def agent_commands(
+    config: Config,
+    context: RunContext,
+    sockets: Sequence[socket.socket],
+    vehicles: Sequence[socket.socket] = (),
+    *,
+    config_path: Path | None = None,
+) -> tuple[Command, ...]:
+    """Return one command for each agent of this computer.
+
+    Args:
+        config: the configuration of the launch.
+        context: the run.
+        sockets: these agents' ends of the vehicle links, which they inherit; empty for real vehicles.
+        vehicles: the simulator's ends of these links, whose ports the agents are given.
+        config_path: resolved configuration, when it is not in the run folder.
+    """
+    commands = []
+    for place, agent in enumerate(context.agents):
+        argv = _python("-m", "swarmctl", "agent", "--config", f"{config_path or context.directory / 'config.toml'}")
+        argv += ("--id", f"{agent}")
+        argv += ("--run", context.run, "--bus", context.endpoint, "--run-dir", f"{context.directory}")
+        fds = (sockets[place].fileno(),) if sockets else ()
+        argv += ("--fd", f"{fds[0]}") if fds else ()
+        argv += ("--vehicle-port", f"{vehicles[place].getsockname()[1]}") if vehicles else ()
+        argv += () if context.identity is None else ("--identity", context.identity.name)
+        argv += (_priority_flag(config, context),)
+        commands.append(Command(agent_name(agent), argv, fds))
+    return tuple(commands)
+
+
+def sitl_command(
+    config: Config, context: RunContext, ports: Sequence[int], sockets: Sequence[socket.socket] = ()
+) -> Command:
+    """Return the command of the built-in simulator, which sends from `sockets`, or own ports, to loopback `ports`."""
+    argv = _python(
+        "-m", "sitl", "--config-json", config.simulator(context.agents).model_dump_json(exclude_defaults=True)
+    )
+    argv += ("--remote-ports", ",".join(str(port) for port in ports))
+    fds = tuple(sock.fileno() for sock in sockets)
+    argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
+    argv += ("--control", f"{control_socket(context.endpoint)}")
+    argv += ("--events", f"{context.directory / 'sitl.events.jsonl'}")
+    argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent", _priority_flag(config, context))
+    return Command(SITL, argv, fds)
+
+
+def control_socket(endpoint: str) -> Path:
+    """Return the path of the socket on which the simulator of a launch takes faults: beside the bus."""
+    return socket_file(endpoint).with_name("sitl.sock")
+
+
+def viewer_command(config: Config, context: RunContext, port: int, *, view: bool, web: bool) -> Command:
+    """Return the command of the viewer process, which owns rerun; it may open a window, and serve a page."""
+    argv = _python("-m", "swarmctl.telemetry.view.viewer", "--run", context.run, "--bus", context.endpoint)
+    argv += ("--flight", viewed_flight(config).model_dump_json(), "--run-dir", f"{context.directory}")
+    argv += ("--port", f"{port}", "--rate-hz", f"{config.telemetry.rate_hz!r}", "--die-with-parent")
+    argv += () if context.identity is None else ("--identity", context.identity.as_json())
+    return Command(VIEWER, argv + (("--view",) if view else ()) + (("--web",) if web else ()))
+
+
+def _priority_flag(config: Config, context: RunContext) -> str:
+    """Return the flag of a process that delays setpoints, predicted paths or vehicle states when it has to wait."""
+    return "--realtime" if wants_realtime(config, context.agents) else "--no-realtime"
+
+
+def _python(*arguments: str) -> tuple[str, ...]:
+    return (sys.executable, *arguments)
+
+
+class Child:
+    """A started process. Start it from the main thread: the kernel ties its life to the thread that did."""
+
+    def __init__(self, command: Command, directory: Path) -> None:
+        self.name, self.argv = command.name, command.argv
+        self.log = directory / f"{command.name}.log"
+        self.ended_s: float | None = None
+        try:
+            with self.log.open("ab") as log:
+                self._process = subprocess.Popen(
+                    command.argv,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    env=_environment(os.environ),
+                    pass_fds=command.fds,
+                    start_new_session=True,
+                )
+        except OSError as error:
+            raise StartError(f"{command.name}: {command.argv[0]} can't be started: {error}") from error
+        self.pid = self._process.pid
+
+    def poll(self) -> int | None:
+        """Return the exit code as a shell does (128 + signal), or None while running."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        if self.ended_s is None:
+            self.ended_s = time.monotonic()
+        return code if code >= 0 else 128 - code
+
+    def is_stopped(self) -> bool:
+        """Return whether it is stopped by a signal or a debugger."""
+        with contextlib.suppress(psutil.Error):
+            return bool(psutil.Process(self.pid).status() in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP))
+        return False
+
+    def signal(self, signum: int) -> None:
+        """Send a signal, unless the process has ended."""
+        with contextlib.suppress(ProcessLookupError):
+            self._process.send_signal(signum)
+
+    def kill_all(self) -> None:
+        """Send SIGKILL to every process of the child's session, also to orphans of it."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, signal.SIGKILL)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait, and return whether it ended in time."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(max(0.0, timeout_s))
+        return self.poll() is not None
+
+    def how_it_ended(self) -> str:
+        """Return how it ended, in words, with its last line of output."""
+        code = self._process.poll()
+        if code is None:
+            return "is running"
+        if code < 0:
+            return f"was killed by {signal.Signals(-code).name}"
+        last = self.last_line()
+        return f"ended with exit code {code}" + (f": {last}" if last else "")
+
+    def last_line(self) -> str:
+        """Return the last line of its log that is not empty."""
+        lines = [line.strip() for line in self._tail().splitlines() if line.strip()]
+        return printable(lines[-1]) if lines else ""
+
+    def line_with(self, text: str) -> str:
+        """Return the first line of its log that contains `text`, or ""."""
+        with contextlib.suppress(OSError):
+            for line in self.log.read_text(encoding="utf-8", errors="replace").splitlines():
+                if text in line:
+                    return printable(line.strip())
+        return ""
+
+    def _tail(self) -> str:
+        with contextlib.suppress(OSError), self.log.open("rb") as log:
+            log.seek(max(0, self.log.stat().st_size - _TAIL_BYTES))
+            return log.read().decode("utf-8", errors="replace")
+        return ""
+
+
+def end_all(children: Sequence[Child], grace_s: float) -> None:
+    """Send SIGTERM, wait for a common deadline, then SIGKILL the remaining sessions."""
+    for child in children:
+        if child.poll() is None:
+            child.signal(signal.SIGTERM)
+    deadline_s = time.monotonic() + grace_s
+    for child in children:
+        child.wait(deadline_s - time.monotonic())
+    kill_all(children)
+
+
+def kill_all(children: Sequence[Child]) -> None:
+    """Kill every process now, and reap it."""
+    for child in children:
+        child.kill_all()
+    for child in children:
+        child.wait(2.0)
+
+
+def _environment(base: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment of a child. Rayon (rerun) gets one thread, as linear algebra: agents share the cores."""
+    return {**base, "RAYON_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", PARENT_ENV: str(os.getpid())}

@@ -1,0 +1,143 @@
+"""`swarmctl station`: shows, records and judges a swarm that flies from several computers, and lets verbs act on it.
+
+No agent needs it: it may start late, end early, or never be there. What it records are the reports of the agents, so
+it judges by estimates, as a launch over real vehicles does.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.messages.json_messages import decode_obstacles
+from swarmctl.bus.network.hosts import links_of
+from swarmctl.bus.network.identity_files import STATION
+from swarmctl.bus.topics import OBSTACLES, TICK
+from swarmctl.config import Config, own_identity
+from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
+from swarmctl.core.recorded.records import unpack_tick
+from swarmctl.core.types import Phase
+from swarmctl.errors import ConfigError
+from swarmctl.ops.flight.host import refuse_unidentified, shared_run_name
+from swarmctl.ops.flight.launch import LaunchOptions, SwarmPart, judged, started
+from swarmctl.ops.flight.launch_result import LaunchResult
+from swarmctl.ops.flight.processes import ROUTER, VIEWER
+from swarmctl.ops.supervision.bus_report import BusReport
+from swarmctl.ops.supervision.status_table import AgentView, Display, tell
+from swarmctl.ops.supervision.viewer_watch import ViewerWatch
+from swarmctl.process_lifetime import StopRequest
+from swarmctl.telemetry.recording.obstacle_lists import recorded_list
+from swarmctl.telemetry.recording.recorder import Recorder
+
+_STEP_S = 0.05
+_GONE_S = 3.0  # an agent that was done and is silent for so long has ended
+
+
+def run_station(config: Config, options: LaunchOptions) -> int:
+    """Watch a whole swarm until every agent has ended, or until Ctrl-C, and return the exit code of its flight.
+
+    Raises:
+        ConfigError, StartError: it was refused, or did not come up.
+    """
+    if not config.hosts:
+        raise ConfigError("hosts", ["the configuration lists none; a swarm on one computer flies by: swarmctl launch"])
+    refuse_unidentified(config, STATION)
+    links = links_of(config.hosts, own_identity(config, STATION))
+    part = SwarmPart(run=shared_run_name(config), agents=(), links=links)
+    with StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stop:
+        with started(config, options, part) as services:
+            watch = SwarmWatch(
+                services.joined_bus,
+                config.swarm.agents,
+                services.context.directory,
+                services.display,
+                note=services.log.write,
+            )
+            told = partial(tell, services.log, services.display)
+            viewer = ViewerWatch(services.children.get(VIEWER), told, services.announce)
+            router = services.children[ROUTER]
+            while not (stop.count or watch.step()):
+                viewer.step()
+                if router.poll() is not None:
+                    watch.problems.append(f"router {router.how_it_ended()}; see {router.log}. The swarm flies on")
+                    break
+                time.sleep(_STEP_S)
+            watch.close()
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
+    interrupted = bool(stop.count) or watch.was_stopped
+    result = LaunchResult(problems=watch.problems, interrupted=interrupted, has_armed=True)
+    return judged(config, services, result)
+
+
+class SwarmWatch:
+    """Shows and records agents that run elsewhere.
+
+    Args:
+        bus: receives their statuses and ticks.
+        agents: size of the swarm.
+        directory: run folder for what they report.
+        display: shows them.
+        note: is told of refused messages, see `Refusals`, and of lists of obstacles.
+        clock_s: monotonic time [s].
+
+    Attributes:
+        problems: what went wrong, in words.
+        was_stopped: whether an operator has ended the mission of an agent.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        agents: int,
+        directory: Path,
+        display: Display,
+        note: Callable[..., None],
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._bus, self._display, self._clock_s = bus, display, clock_s
+        self._report, self._note = BusReport(bus, note, display), note
+        self._obstacles_version: int | None = None
+        self._views = [AgentView(agent=agent) for agent in range(agents)]
+        self._recorders = {agent_name(agent): Recorder(directory, agent) for agent in range(agents)}
+        self.problems: list[str] = []
+        self.was_stopped = False
+
+    def step(self) -> bool:
+        """Show and record what has arrived; returns whether every agent was done and has ended."""
+        now_s = self._clock_s()
+        for sender, payload in self._bus.receive(TICK):
+            tick = unpack_tick(payload)
+            if tick is not None:
+                self._recorders[sender].tick(tick[0], None)
+        for status in self._report.statuses():
+            if 0 <= status.agent < len(self._views):
+                view = self._views[status.agent]
+                view.status, view.received_s = status, now_s
+        for _, payload in self._bus.receive(OBSTACLES):
+            message = decode_obstacles(payload)
+            if message is not None and message.replaces(self._obstacles_version):
+                self._obstacles_version = message.version
+                self._note("obstacles", **recorded_list(message))
+        self._report.step()
+        self._display.show(self._views)
+        over = all(self._has_ended(view, now_s) for view in self._views)
+        if over:
+            outcomes = {view.agent: view.status.outcome for view in self._views if view.status is not None}
+            self.was_stopped = OPERATOR_STOP in outcomes.values()
+            for agent, outcome in outcomes.items():
+                if outcome not in ("completed", OPERATOR_STOP):
+                    self.problems.append(f"{agent_name(agent)} failed: {outcome or 'no reason given'}")
+        return over
+
+    def close(self) -> None:
+        """Write what is still to be recorded."""
+        for recorder in self._recorders.values():
+            recorder.close()
+
+    def _has_ended(self, view: AgentView, now_s: float) -> bool:
+        done = view.status is not None and view.status.phase == Phase.DONE
+        return done and now_s - view.received_s > _GONE_S

@@ -1,0 +1,190 @@
+"""End of a run: the referee judges the run folder, and the result is printed in five lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from swarmctl.config import Config, load_recorded
+from swarmctl.core.text import printable
+from swarmctl.mavlink.signing.refusals import HARMLESS
+from swarmctl.ops.flight.launch_result import LaunchResult
+from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
+
+_MISSED_SHOWN = 5  # agents that are named because they have not reached their goals
+
+
+def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Callable[[str], None]) -> bool:
+    """Finish the run folder and print the result; return whether the referee found a violation.
+
+    A folder that can't be read or written is a problem of the run, and never loses the result.
+    """
+    from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
+    from swarmctl.telemetry.view.recordings import optimize_recording  # heavy
+
+    try:
+        outcome = Outcome(outcome=result.outcome, problems=tuple(result.problems))
+        summary, unwritten = finish_run(directory, config.rules(), outcome)
+    except Exception as error:
+        known = {"outcome": result.outcome, "violations": list(result.problems)}
+        for line in (*violation_lines(known), *summary_lines(known, directory)):
+            print_line(line)
+        result.problems.append(f"summary: {error}")
+        print_line(f"the run can't be judged: {error!r}. What was recorded is in {directory}")
+        return False
+    for line in (*violation_lines(summary), *summary_lines(summary, directory)):
+        print_line(line)
+    if unwritten:
+        result.problems.append(f"run folder: {'; '.join(unwritten)}")
+        print_line(unwritten_line(directory, unwritten))
+    optimize_recording(directory)
+    return bool(summary.get("violations"))
+
+
+def unwritten_line(directory: Path, unwritten: Sequence[str]) -> str:
+    """Return the line that reports files the disk did not take."""
+    return (
+        f"not everything could be written to {directory}: {'; '.join(unwritten)}. "
+        f"Make room, then: swarmctl report {directory}"
+    )
+
+
+def rewrite_report(directory: Path) -> Path:
+    """Write `report.html` of a run folder again and return its path.
+
+    Raises:
+        ConfigError: it is no run folder.
+    """
+    from swarmctl.telemetry.recording.run_folder import report_run  # heavy
+
+    return report_run(directory, load_recorded(directory).rules())
+
+
+def write_figures(directory: Path, *, png: bool) -> Path:
+    """Write every figure of a run folder as an SVG file, and as PNG too, and return the folder they are in.
+
+    Raises:
+        ConfigError: it is no folder of a finished run.
+    """
+    from swarmctl.telemetry.recording.run_folder import write_run_figures  # heavy
+
+    return write_run_figures(directory, load_recorded(directory).rules(), png=png)
+
+
+def compare(directories: Sequence[Path], output: Path | None) -> Path:
+    """Write a page that sets run folders beside each other and return it; by default it is beside the last of them.
+
+    Raises:
+        ConfigError: one is no folder of a finished run.
+    """
+    from swarmctl.telemetry.recording.run_folder import compare_runs  # heavy
+
+    runs = [(directory, load_recorded(directory).rules()) for directory in directories]
+    names = "-against-".join(directory.resolve().name for directory in directories)
+    return compare_runs(output or directories[-1].resolve().parent / f"{names}.html", runs)
+
+
+def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:
+    """Return five lines: outcome, separation, timing, solver and bus, folder; and one for each own controller."""
+    violations = summary.get("violations") or []
+    obstacles = _section(summary, "obstacles")
+    timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
+    tick, solve, age = _section(timing, "tick_ms"), _section(timing, "solve_ms"), _section(comms, "path_age_ms")
+    rejected = sum(_section(comms, "rejected").values())
+    goals = _goals(_section(summary, "goals"))
+    error = f"summed mean tracking error {_m(_section(summary, 'tracking').get('index_m'))}"
+    outcome = f"{summary.get('outcome')}, {goals}{error} ({SUMMED_ERROR})"
+    if len(violations) == 1:
+        outcome += f"; 1 violation: {printable(violations[0])}"
+    elif violations:
+        outcome += f"; {len(violations)} violations, each with a line above"
+    clearance = obstacles.get("min_clearance_m")
+    return (
+        outcome,
+        _separation(summary)
+        + (
+            f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else ""
+        ),
+        f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')} from arming on, "
+        f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
+        f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
+        f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} bus messages refused"
+        + _refused_frames(comms)
+        + _unresponsive(comms)
+        + _reopened(comms)
+        + _deadlocks(summary),
+        *(
+            f"{printable(own['name'])} flew {own['flown_ticks']} of {own['mission_ticks']} mission ticks"
+            for own in summary.get("own_controllers") or ()
+        ),
+        f"run folder {directory}",
+    )
+
+
+def _separation(summary: Mapping[str, Any]) -> str:
+    found = _section(summary, "separation")
+    if summary.get("agents") == 1:
+        return "no other agent"
+    return f"separation {_m(found.get('min_m'))} (required {_m(found.get('required_m'))})"
+
+
+def _goals(found: Mapping[str, Any]) -> str:
+    """Return how many agents have reached their goals, and who has not; "" of a mission without goals."""
+    if not found:
+        return ""
+    missed = [row for row in found["agents"] if row["reached_at_s"] is None]
+    if not missed:
+        last_s = max(row["reached_at_s"] for row in found["agents"])
+        return f"{found['of']} of {found['of']} goals reached, the last after {last_s:.1f} s, "
+    said = [f"agent {row['id']} {_far(row['left_m'])}" for row in missed[:_MISSED_SHOWN]]
+    said += [f"{len(missed) - _MISSED_SHOWN} more are not there"] if len(missed) > _MISSED_SHOWN else []
+    return f"only {found['reached']} of {found['of']} goals reached ({', '.join(said)}), "
+
+
+def _far(left_m: float | None) -> str:
+    return "never began" if left_m is None else f"is {left_m:.2f} m away"
+
+
+def _refused_frames(comms: Mapping[str, Any]) -> str:
+    count = sum(n for reason, n in _section(comms, "refused_frames").items() if reason not in HARMLESS)
+    return f", {count} MAVLink frames refused" if count else ""
+
+
+def _unresponsive(comms: Mapping[str, Any]) -> str:
+    found = _section(comms, "unresponsive")
+    return f"; agent-{found['agent']} unresponsive for {found['longest_s']:.1f} s" if found.get("count") else ""
+
+
+def _reopened(comms: Mapping[str, Any]) -> str:
+    """Return how often the session of a process was deaf, or seemed so, and was replaced."""
+    count = comms.get("reopened")
+    return f"; bus sessions opened again: {count}" if count else ""
+
+
+def violation_lines(summary: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return one line per violation when there are several; the summary's first line holds a single one."""
+    violations = summary.get("violations") or []
+    return tuple(f"violation: {printable(violation)}" for violation in violations) if len(violations) > 1 else ()
+
+
+def _deadlocks(summary: Mapping[str, Any]) -> str:
+    found = _section(summary, "deadlocks")
+    return f"; {found['count']} deadlocks, {found['unresolved']} unresolved" if found.get("count") else ""
+
+
+def _section(tree: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = tree.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def _count(tree: Mapping[str, Any], key: str) -> str:
+    return str(tree.get(key, "-"))
+
+
+def _m(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f} m"
+
+
+def _ms(values: Mapping[str, Any], keys: tuple[str, ...] = ("p50", "p99", "max")) -> str:
+    return "/".join("-" if values.get(key) is None else f"{values[key]:.1f}" for key in keys)

@@ -1,0 +1,51 @@
+"""Gives a running launch another mission: read from a file, checked as before a launch, sent, and ordered."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from swarmctl.bus.messages.json_messages import MissionMessage, encode_message
+from swarmctl.bus.topics import MAX_MISSION_BYTES
+from swarmctl.bus.topics import MISSION as MISSION_TOPIC
+from swarmctl.config import load_mission, load_recorded
+from swarmctl.control.reference.mission import MissionParams
+from swarmctl.core.operator_verbs import BEGIN, MISSION, Order
+from swarmctl.errors import ConfigError
+from swarmctl.ops.orders.operator import RunningLaunch, read_statuses
+from swarmctl.ops.orders.order_delivery import Reply, deliver
+
+_LEAD_S = 1.5  # from the order to the begin of the mission, the same for all
+_NUMBER_BYTES = 6  # of a digest: a number that a floating-point argument holds exactly
+
+
+def set_mission(launch: RunningLaunch, file: Path, agents: Sequence[int]) -> list[Reply]:
+    """Have agents of a launch, or all, fly the mission of a file; returns what each has answered.
+
+    Raises:
+        ConfigError: there is no such agent, or the mission can't be flown by this launch.
+        StartError: the bus can't be joined.
+    """
+    mission = load_mission(load_recorded(Path(launch.run_dir)), file)
+    message = mission_message(mission)
+    payload = encode_message(message)
+    if len(payload) > MAX_MISSION_BYTES:
+        takes = f"takes {len(payload)} bytes; {MAX_MISSION_BYTES} at most while a launch flies"
+        raise ConfigError(str(file), [f"{takes}. Give fewer points, or start a launch with it"])
+    order = Order(MISSION, {MISSION: message.mission, BEGIN: _begin_utc_s(launch)})
+    return deliver(launch, order, agents, before=((MISSION_TOPIC, payload),))
+
+
+def mission_message(mission: MissionParams) -> MissionMessage:
+    """Return the message that tells agents of a mission; its number follows from what it says."""
+    text = mission.model_dump_json(exclude_defaults=True)
+    digest = hashlib.sha256(text.encode()).digest()[:_NUMBER_BYTES]
+    return MissionMessage(mission=int.from_bytes(digest, "big"), text=text)
+
+
+def _begin_utc_s(launch: RunningLaunch) -> float:
+    """Return when the mission begins, by the clock of the agent that is farthest ahead."""
+    clocks_us = [status.utc_us for status in read_statuses(launch).values()]
+    return max(clocks_us, default=time.time_ns() // 1000) * 1e-6 + _LEAD_S

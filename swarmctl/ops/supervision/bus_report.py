@@ -1,0 +1,54 @@
+"""What a supervisor and a station report of the bus itself: messages refused, and sessions that were deaf."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+
+from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.messages.json_messages import StatusMessage, decode_status
+from swarmctl.bus.refusals import HARMLESS, IDENTITY, MALFORMED, Refusals
+from swarmctl.bus.silence import SessionWatch
+from swarmctl.bus.topics import STATUS
+from swarmctl.ops.supervision.status_table import Display
+
+_REOPENED = "another session of the bus has taken over: the one before may have been deaf"
+
+
+class BusReport:
+    """Takes statuses from the bus, and reports what was not one, and what the bus did not deliver.
+
+    Args:
+        bus: whose.
+        note: writes events, see `Refusals`.
+        display: prints lines.
+    """
+
+    def __init__(self, bus: Bus, note: Callable[..., None], display: Display) -> None:
+        self._bus, self._display = bus, display
+        self._refusals = Refusals(note)
+        self._sessions = SessionWatch(bus, partial(note, text=_REOPENED))
+        self._has_told_reopened = False
+
+    def statuses(self) -> Iterator[StatusMessage]:
+        """Yield the statuses that have arrived, each by the agent it is of; the others are refused."""
+        for sender, payload in self._bus.receive(STATUS):
+            status = decode_status(payload)
+            if status is not None and sender == agent_name(status.agent):
+                yield status
+            else:
+                self._refuse(sender, STATUS.name, MALFORMED if status is None else IDENTITY)
+
+    def step(self) -> None:
+        """Report what is new: refused messages, the first of each kind in words, and another session."""
+        for message in self._bus.refused():
+            self._refuse(*message)
+        self._refusals.report(time.time_ns() // 1000)
+        if self._sessions.step() and not self._has_told_reopened:  # while there is nobody, it happens again and again
+            self._has_told_reopened = True
+            self._display.print_line(_REOPENED)
+
+    def _refuse(self, sender: str, topic: str, reason: str) -> None:
+        if self._refusals.add(sender, topic, reason, time.time_ns() // 1000) == 1 and reason not in HARMLESS:
+            self._display.print_line(f"{topic} in the name of {sender} refused: {reason}")

@@ -1,0 +1,82 @@
+"""Recovery of a vehicle whose agent ended before the vehicle was known to be on the ground and disarmed.
+
+A second agent is started on the same link. It only lands the vehicle and waits for the HEARTBEAT that reports it as
+disarmed; the autopilot's own failsafes act meanwhile. A vehicle that can't be recovered is named, so that no launch
+ends with an armed vehicle unreported.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+from swarmctl.core.types import Phase
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_START, StartError
+from swarmctl.ops.flight.processes import Child
+from swarmctl.ops.supervision.status_table import AgentView, name_of
+
+RECOVERY_S = 90.0  # a failsafe that returns home first needs most of it
+_DOWN = (EXIT_OK, EXIT_INTERRUPTED)  # an agent ends with these only when its vehicle is down
+
+
+class Recovery:
+    """Keeps track of every vehicle of a launch that may be left armed.
+
+    Args:
+        start: starts an agent on a vehicle's link that only lands it.
+        sysids: system id of each vehicle, by agent.
+    """
+
+    def __init__(self, start: Callable[[int], Child], sysids: Sequence[int]) -> None:
+        self._start, self._sysids = start, sysids
+        self._begun_s: dict[int, float] = {}
+        self._lost: set[int] = set()  # agents whose vehicles are not known to be down, and are not watched any more
+
+    def is_on(self, agent: int) -> bool:
+        """Return whether the newest agent of this vehicle only lands it."""
+        return agent in self._begun_s
+
+    def is_overdue(self, agent: int) -> bool:
+        """Return whether the recovery of a vehicle takes longer than allowed."""
+        return agent in self._begun_s and time.monotonic() - self._begun_s[agent] > RECOVERY_S
+
+    def begin(self, view: AgentView, code: int) -> Child | None:
+        """Register an ended agent; return the process that recovers its vehicle, or None.
+
+        Raises:
+            StartError, OSError: it can't be started; the vehicle counts as lost.
+        """
+        if code in _DOWN or (code == EXIT_START and not self.is_on(view.agent)):
+            self._lost.discard(view.agent)
+            return None
+        if view.status is not None and view.status.phase == Phase.DONE:
+            return None
+        if self.is_on(view.agent) or view.status is None:
+            self._lost |= {view.agent} if view.status is not None else set()
+            return None
+        self._begun_s[view.agent] = time.monotonic()
+        try:
+            return self._start(view.agent)
+        except (StartError, OSError):
+            self._lost.add(view.agent)
+            raise
+
+    def left(self, views: Sequence[AgentView]) -> list[str]:
+        """Return one line for each vehicle that may still be armed or in the air."""
+        return [self._words(view) for view in views if view.agent in self._lost]
+
+    def give_up(self, views: Sequence[AgentView]) -> None:
+        """Count every vehicle whose agent is killed before it was done as lost."""
+        going = (view for view in views if view.status is not None and view.status.phase != Phase.DONE)
+        self._lost |= {view.agent for view in going if view.status and view.status.phase >= Phase.ARM}
+
+    def _words(self, view: AgentView) -> str:
+        status = view.status
+        if status is None:
+            return f"vehicle {self._sysids[view.agent]}: nothing is known of it"
+        armed = "armed" if status.armed else "not yet told to be armed"
+        return (
+            f"vehicle {self._sysids[view.agent]} (agent-{view.agent}) may be armed or in the air: it was {armed}, in "
+            f"{name_of(Phase, status.phase)}, {time.monotonic() - view.received_s:.0f} s ago. "
+            "Land and disarm it by hand"
+        )

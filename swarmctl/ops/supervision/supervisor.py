@@ -1,0 +1,356 @@
+"""Supervision of one flight: reads agents' status, watches processes, orders the landing and collects the result.
+
+The supervisor never flies: it commands agents as an operator on the bus. When a process dies, that is reported and the
+others go on; only without an essential process (router, simulator) all agents land.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from functools import partial
+
+from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.orders import EVERYBODY, order_messages
+from swarmctl.bus.topics import COMMAND, ENDED, Topic
+from swarmctl.config import Config
+from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
+from swarmctl.core.types import Phase
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
+from swarmctl.ops.flight.launch_result import LaunchResult, why_it_failed
+from swarmctl.ops.flight.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
+from swarmctl.ops.orders.order_delivery import numbered
+from swarmctl.ops.supervision.bus_report import BusReport
+from swarmctl.ops.supervision.hearing import Hearing
+from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
+from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery
+from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
+from swarmctl.ops.supervision.viewer_watch import ViewerWatch
+from swarmctl.telemetry.recording.event_log import EventLog
+from swarmctl.telemetry.recording.obstacle_lists import recorded_list
+
+_STEP_S = 0.05
+_FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
+_VEHICLE_S = 90.0  # timeout for every agent to receive its vehicle
+_BEYOND_MISSION_S = 300.0  # for take-off, waiting and landing; a longer flight is ended
+_SILENCE_S = 5.0
+_PAUSE_S = 0.5  # of the supervisor
+_LAND_S = 60.0
+_LAND_REPEAT_S = 0.5
+_LAND_OBEYED_S = 10.0
+_ROUTER_STARTS = 3  # in one flight
+_AFTER_DEATH_S = 3.0  # the simulator must outlive a dead agent until its vehicle has landed
+
+
+class Services:
+    """Services that a flight relies on; `swarmctl.ops.flight.launch` starts and stops them."""
+
+    context: RunContext
+    log: EventLog
+    children: dict[str, Child]  # by name; agents have their names on the bus
+    bus: Bus | None = None
+
+    def announce(self, view: str) -> None:
+        """Publish the address of the live view to the operator's commands."""
+        raise NotImplementedError
+
+    def restart_router(self) -> None:
+        """Start the router again; the sessions of everybody find it."""
+        raise NotImplementedError
+
+    def recover(self, agent: int) -> Child:
+        """Start an agent that only lands the vehicle of an ended one."""
+        raise NotImplementedError
+
+
+class FlightSupervisor:
+    """Watches one launch until every agent has ended or has been given up."""
+
+    def __init__(self, config: Config, services: Services, display: Display) -> None:
+        if services.bus is None:
+            raise ValueError("the bus must be up before the flight is watched")
+        self._config = config
+        self._services = services
+        self._bus: Bus = services.bus
+        self._display = display
+        self._announce = partial(tell, services.log, display)
+        self._result = LaunchResult()
+        self._viewer_watch = ViewerWatch(services.children.get(VIEWER), self._announce, services.announce)
+        self._views = [AgentView(agent=agent) for agent in services.context.agents]
+        self._obstacles = ObstacleKeeper(self._bus, config.obstacles)
+        self._report = BusReport(self._bus, services.log.write, display)
+        self._hearing = Hearing(self._bus, self._announce)
+        self._started_s = self._stepped_s = time.monotonic()
+        self._mission_ends_s = self._started_s + config.mission.duration_s  # at the earliest
+        self._reported: set[str] = set()
+        self._router_starts = 0  # how often it was started again
+        self._essential_lost = False  # an essential process, router or simulator, has ended
+        self._vehicles_lost = False  # the simulator has ended, and its vehicles with it
+        self._recovery = Recovery(services.recover, config.sysids())
+        self._land_ordered_s: float | None = None
+        self._land_said_s = 0.0
+        self._land_until_s = 0.0
+
+    def fly(self, interrupts: Callable[[], int]) -> LaunchResult:
+        """Watch the flight to its end.
+
+        Args:
+            interrupts: number of stop requests; the first lands all agents, the second kills all processes.
+        """
+        if configured := self._obstacles.newest.obstacles:
+            text = f"{len(configured)} obstacles, as configured"
+            self._services.log.write("obstacles", text=text, **recorded_list(self._obstacles.newest))
+        while interrupts() < 2:
+            self._excuse_own_pause()
+            self._receive()
+            self._watch_essential_processes()
+            self._viewer_watch.step()
+            self._watch_agents()
+            self._watch_time()
+            if interrupts() and not self._result.interrupted:
+                self._result.interrupted = True
+                self._announce("interrupted", "interrupted: landing; once more ends everything at once")
+                self._land(_LAND_S)
+            self._speak()
+            self._display.show(self._views)
+            if self._is_over():
+                return self._report_left_vehicles()
+            time.sleep(_STEP_S)
+        self._result.interrupted = True
+        self._fail("killed", "interrupted twice: every process was killed, vehicles were left to their autopilots")
+        running = self._running()
+        kill_all(list(self._services.children.values()))
+        if not self._config.sitl.enabled:
+            self._recovery.give_up(running)
+        return self._report_left_vehicles()
+
+    def _report_left_vehicles(self) -> LaunchResult:
+        """Report every vehicle that is not known to be on the ground."""
+        self._result.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
+        for words in self._result.left:
+            self._fail("vehicle_left", words)
+        return self._result
+
+    def _excuse_own_pause(self) -> None:
+        """Count no time in which this process itself did not run: what arrived then is not yet passed on."""
+        now_s = time.monotonic()
+        paused_s = now_s - self._stepped_s
+        self._stepped_s = now_s
+        if paused_s > _PAUSE_S:
+            for view in self._views:
+                view.received_s += paused_s if view.status is not None else 0.0
+
+    def _receive(self) -> None:
+        for status in self._report.statuses():
+            view = next((view for view in self._views if view.agent == status.agent), None)
+            if view is None:  # of another computer
+                continue
+            if view.status is None or view.status.phase != status.phase:
+                self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
+            view.status, view.received_s = status, time.monotonic()
+            self._hearing.hear(view.agent)
+            if status.phase == Phase.TRACK:  # also of a mission that an operator has set
+                self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + status.ends_in_s)
+            self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
+        for message in self._obstacles.receive():
+            text = f"{len(message.obstacles)} obstacles, set by an operator"
+            self._announce("obstacles", text, **recorded_list(message))
+        self._report.step()
+
+    def _watch_essential_processes(self) -> None:
+        """Start a router again; land all agents when it ends again and again, or the simulator has ended."""
+        router = self._services.children.get(ROUTER)
+        if router is not None and router.poll() is not None and self._router_starts < _ROUTER_STARTS:
+            self._router_starts += 1
+            self._announce("router_ended", f"router {router.how_it_ended()}; it is started again, the flight goes on")
+            try:
+                self._services.restart_router()
+            except (StartError, OSError) as error:
+                self._announce("router_failed", f"the router can't be started again: {error}")
+        for name, land_s in ((ROUTER, _LAND_S), (SITL, _AFTER_DEATH_S)):
+            child = self._services.children.get(name)
+            if child is not None and child.poll() is not None and self._is_first(name):
+                self._essential_lost = True
+                self._vehicles_lost |= name == SITL
+                self._result.could_not_start |= not any(view.status for view in self._views)
+                self._fail(f"{name}_ended", f"{name} {child.how_it_ended()}; landing. See {child.log}")
+                self._land(land_s)
+
+    def _watch_agents(self) -> None:
+        now_s = time.monotonic()
+        for view in self._views:
+            child = self._services.children[agent_name(view.agent)]
+            code = child.poll()
+            if code is None:
+                self._check_responsive(view, child, now_s)
+            elif self._is_first(_end_of(child)):
+                self._vouch_for_end(view.agent)
+                self._note_end(view, child, code)
+                self._recover(view, code)
+
+    def _vouch_for_end(self, agent: int) -> None:
+        """Tell the others that the process of an agent has ended, before another one is started in its place."""
+        others = [view for view in self._running() if view.agent != agent]
+        self._order(Order(EXCLUDE, {PEER: agent}), others, topic=ENDED)
+
+    def _order(self, order: Order, views: list[AgentView], agent: int = EVERYBODY, *, topic: Topic = COMMAND) -> None:
+        """Give an order to an agent, or all, stamped by the clocks of these. A repetition is another, obeyed anew."""
+        now_s = time.monotonic()
+        clocks_us = [
+            view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in views if view.status is not None
+        ]
+        for message in order_messages(numbered(order), agent, time.time_ns() // 1000, clocks_us):
+            self._bus.publish(topic, message)
+
+    def _recover(self, view: AgentView, code: int) -> None:
+        """Start another process that lands a vehicle which is not known to be down."""
+        if self._recovery.is_on(view.agent) and code == EXIT_INTERRUPTED:
+            self._announce("recovered", f"the vehicle of {agent_name(view.agent)} is on the ground and disarmed")
+        try:
+            child = None if self._vehicles_lost else self._recovery.begin(view, code)
+        except (StartError, OSError) as error:
+            self._fail("recovery_failed", f"the vehicle of {agent_name(view.agent)} can't be recovered: {error}")
+            return
+        if child is None:
+            return
+        self._services.children[agent_name(view.agent)] = child
+        view.note, view.received_s = "recovering", time.monotonic()
+        self._announce(
+            "recovering", f"landing the vehicle of {agent_name(view.agent)}, which may be armed or in the air"
+        )
+        if self._land_ordered_s is not None:
+            self._land_until_s = max(self._land_until_s, time.monotonic() + RECOVERY_S)
+
+    def _check_responsive(self, view: AgentView, child: Child, now_s: float) -> None:
+        waited_s = now_s - self._started_s
+        if view.status is None:
+            if waited_s > _FIRST_STATUS_S and self._is_first(f"{child.name} unresponsive"):
+                self._refuse(f"{child.name} is not on the bus after {_FIRST_STATUS_S:.0f} s; see {child.log}")
+        elif self._recovery.is_on(view.agent):
+            if self._recovery.is_overdue(view.agent):
+                child.kill_all()
+        elif self._hearing.is_silent(view.agent, now_s - view.received_s, _SILENCE_S):
+            view.note = "silent"
+            if self._is_first(f"{child.name} silent"):
+                self._fail(
+                    "agent_unresponsive", f"{child.name} has been silent for {_SILENCE_S:.0f} s; the others fly on"
+                )
+        elif view.note:
+            view.note = ""
+            self._announce("agent_back", f"{child.name} responds again")
+        elif view.status.phase == Phase.CONNECT and waited_s > _VEHICLE_S and self._is_first(f"{child.name} vehicle"):
+            url = self._config.vehicles[view.agent].url if self._config.vehicles else "the built-in SITL"
+            self._refuse(
+                f"{child.name} hears no vehicle at {url} after {_VEHICLE_S:.0f} s; check that it is on and sends"
+            )
+
+    def _watch_time(self) -> None:
+        limit_s = self._mission_ends_s + _BEYOND_MISSION_S - self._started_s
+        if time.monotonic() - self._started_s > limit_s and self._is_first("too long"):
+            self._fail("too_long", f"the flight did not end within {limit_s:.0f} s; landing")
+            self._land(_LAND_S)
+
+    def _speak(self) -> None:
+        now_s = time.monotonic()
+        self._obstacles.repeat()
+        if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
+            self._land_said_s = now_s
+            self._repeat_land_order(now_s - self._land_ordered_s)
+
+    def _repeat_land_order(self, since_s: float) -> None:
+        """Repeat the order on the bus, newly stamped, until every agent shows that it lands; later also by signal."""
+        running = (view for view in self._running() if not self._recovery.is_on(view.agent))
+        deaf = [
+            view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND or view.status.held
+        ]
+        if deaf and len(self._views) == self._config.swarm.agents:
+            self._order(Order("land"), deaf)
+        elif deaf:  # agents of other computers fly on
+            for view in deaf:
+                self._order(Order("land"), [view], view.agent)
+        for view in deaf:
+            child = self._services.children[agent_name(view.agent)]
+            if since_s > _LAND_OBEYED_S and self._is_first(f"{child.name} told by signal"):
+                child.signal(signal.SIGTERM)
+
+    def _is_over(self) -> bool:
+        """Return whether no agent is left to wait for. Silent agents are given up when no other one flies."""
+        now_s = time.monotonic()
+        running = self._running()
+        if any(_end_of(child) not in self._reported for child in self._agents() if child.poll() is not None):
+            return False  # it has ended since the agents were watched, and may say how the flight went
+        if self._land_ordered_s is not None and now_s > self._land_until_s:
+            for view in running:
+                if not self._recovery.is_on(view.agent):
+                    self._fail("not_landed", f"{agent_name(view.agent)} did not end in time and was killed")
+                kill_all([self._services.children[agent_name(view.agent)]])
+            return not running
+        if not running:
+            deaths_s = [
+                c.ended_s
+                for c in self._services.children.values()
+                if c.ended_s is not None and c.poll() not in (0, 130)
+            ]
+            return self._essential_lost or not deaths_s or now_s - max(deaths_s) > _AFTER_DEATH_S
+        if self._land_ordered_s is None and all(view.note == "silent" for view in running):
+            bus_is_suspect = len(running) == len(self._views) and len(running) > 1
+            self._land(_LAND_S if bus_is_suspect else _AFTER_DEATH_S)
+        return False
+
+    def _note_end(self, view: AgentView, child: Child, code: int) -> None:
+        view.note = "done" if code == EXIT_OK else f"exit {code}"
+        self._services.log.write("agent_ended", agent=view.agent, exit_code=code)
+        if code == EXIT_OK or self._essential_lost or self._recovery.is_on(view.agent):
+            return
+        if code == EXIT_INTERRUPTED:
+            self._result.interrupted |= self._land_ordered_s is None  # ended by an operator's `land`
+        elif code == EXIT_START:
+            self._refuse(f"{child.name} could not start: {child.last_line()}")
+        elif code == EXIT_MISSION:
+            outcome = view.status.outcome if view.status else ""
+            self._fail("agent_failed", f"{child.name} failed: {why_it_failed(outcome, child.last_line())}")
+        elif view.status is None:
+            self._refuse(f"{child.name} could not start: it {child.how_it_ended()}")
+        else:
+            view.note = "dead"
+            self._fail("agent_died", f"{child.name} {child.how_it_ended()}; the others fly on")
+
+    def _land(self, timeout_s: float) -> None:
+        """Order all agents to land over the bus; by signal where the bus does not reach."""
+        now_s = time.monotonic()
+        if self._land_ordered_s is None:
+            self._land_ordered_s, self._land_until_s = now_s, now_s + timeout_s
+            self._services.log.write("land")
+        self._land_until_s = min(self._land_until_s, now_s + timeout_s)
+        for view in self._running():
+            if self._recovery.is_on(view.agent):
+                continue
+            if self._essential_lost or view.status is None or view.note == "silent":
+                self._services.children[agent_name(view.agent)].signal(signal.SIGTERM)
+
+    def _refuse(self, problem: str) -> None:
+        self._result.could_not_start = True
+        self._fail("start_failed", problem)
+        self._land(_LAND_S)
+
+    def _fail(self, event: str, problem: str) -> None:
+        self._result.problems.append(problem)
+        self._announce(event, problem)
+
+    def _is_first(self, what: str) -> bool:
+        if what in self._reported:
+            return False
+        self._reported.add(what)
+        return True
+
+    def _agents(self) -> list[Child]:
+        return [self._services.children[agent_name(view.agent)] for view in self._views]
+
+    def _running(self) -> list[AgentView]:
+        return [view for view, child in zip(self._views, self._agents(), strict=True) if child.poll() is None]
+
+
+def _end_of(child: Child) -> str:
+    """Return the words under which the end of this process is noted once."""
+    return f"{child.name} {child.pid} ended"

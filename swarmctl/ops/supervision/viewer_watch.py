@@ -1,0 +1,49 @@
+"""Watches the viewer process of a launch or station: where it shows the flight, and whether it freezes or ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from swarmctl.ops.flight.processes import Child
+
+_ADDRESS, _PAGE = "viewer rerun+", "page http://"  # how the lines begin in which it says where
+
+
+class ViewerWatch:
+    """Tells everything once.
+
+    Args:
+        child: the process; None without a view.
+        tell: receives event, text and fields.
+        publish: receives the address of the live view, for the operator's `view`.
+    """
+
+    def __init__(self, child: Child | None, tell: Callable[..., None], publish: Callable[[str], None]) -> None:
+        self._child, self._tell, self._publish = child, tell, publish
+        argv = () if child is None else child.argv
+        self._hint = "" if {"--view", "--web"} & {*argv} else " (no window; open one with: swarmctl view)"
+        self._awaited = [] if child is None else [_ADDRESS, *([_PAGE] if "--web" in child.argv else [])]
+        self._is_frozen = False
+
+    def step(self) -> None:
+        """Tell what has happened since the last time."""
+        child = self._child
+        if child is None:
+            return
+        if child.poll() is not None:
+            self._tell("viewer_ended", f"view and recording stopped: viewer {child.how_it_ended()}; the flight goes on")
+            self._child = None
+        elif self._awaited and (line := child.line_with(self._awaited[0])):
+            self._take(line)
+        elif not self._is_frozen and child.is_stopped():
+            self._is_frozen = True
+            self._tell("viewer_frozen", "viewer is frozen; the flight goes on")
+
+    def _take(self, line: str) -> None:
+        """Tell the address that a line says."""
+        url = line.split(" ", 1)[1]
+        if self._awaited.pop(0) == _ADDRESS:
+            self._tell("viewer_ready", f"view {url}{self._hint}", url=url)
+            self._publish(url)
+        else:
+            self._tell("page_ready", f"open in a browser: {url}", url=url)

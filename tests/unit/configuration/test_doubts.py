@@ -1,0 +1,93 @@
+"""Tests what is said of configurations that are valid, and may not be what was meant."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import pytest
+
+import swarmctl
+from swarmctl.config import dump, load, load_mission
+from swarmctl.configuration.doubts import config_warnings, warning_lines
+from swarmctl.errors import ConfigError
+
+ROOT = Path(__file__).parents[3]
+GOALS = "mission.goto.goals_ned_m=[[4, 0, -1]]"
+
+
+def lines(*overrides: str) -> list[str]:
+    return config_warnings(load(None, overrides))
+
+
+def test_the_section_of_a_kind_that_is_not_flown_is_named() -> None:
+    (said,) = lines("mission.kind=circle", GOALS)
+    assert said == "mission.goto is set, mission.kind is 'circle': it is not flown"
+    assert warning_lines(load(None, ["mission.kind=circle", GOALS])) == [f"warning: {said}"]
+    assert "mission.own is set" in lines("mission.kind=hover", "mission.own.a=1")[0]
+    assert len(lines("mission.kind=hover", GOALS, "mission.circle.radius_m=3")) == 2
+
+
+def test_without_any_kind_it_is_refused() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(None, [GOALS, "mission.helix.rise_s=9"])
+    (problem,) = caught.value.problems
+    assert problem.startswith("mission.goto is set, as mission.helix, mission.kind is not: 'circle' would be flown")
+    assert problem.endswith("Set mission.kind = 'goto'")
+    with pytest.raises(ConfigError, match="'module:Class'"):
+        load(None, ["mission.own.a=1"])
+
+
+def test_so_is_a_mission_for_a_running_launch(tmp_path: Path) -> None:
+    path = tmp_path / "mission.toml"
+    path.write_text("[mission.goto]\ngoals_ned_m = [[4.0, 0.0, -1.0]]\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match="is not: 'circle' would be flown"):
+        load_mission(load(None), path)
+
+
+def test_negative_control_nothing_is_said_of_what_is_flown(tmp_path: Path) -> None:
+    assert lines() == lines("mission.circle.radius_m=3") == lines("mission.kind=goto", GOALS) == []
+    assert lines("mission.identify.step_m=1") == [], "which check --identify flies, whatever the mission"
+    path = tmp_path / "config.toml"
+    path.write_text(dump(load(None, ["mission.kind=goto", GOALS])), encoding="utf-8")
+    assert config_warnings(load(path)) == [], "a resolved configuration holds every section"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").rglob("*.toml")), ids=lambda path: path.name)
+def test_nothing_is_said_of_our_own_files(path: Path) -> None:
+    assert config_warnings(load(path)) == []
+
+
+def begins_at(tmp_path: Path, z_m: float, *overrides: str) -> list[str]:
+    path = tmp_path / "up.csv"
+    path.write_text(f"t,x,y,z\n0,0,0,{z_m}\n20,1,0,{z_m}\n", encoding="utf-8")
+    flown = ("mission.kind=csv", f"mission.csv.files=['{path}']", "mission.duration_s=20")
+    return lines(*flown, "start.center_ned_m=[0,0,-2]", *overrides)
+
+
+def test_a_reference_that_begins_away_from_its_agent_is_named(tmp_path: Path) -> None:
+    said = begins_at(tmp_path, -2.5, "mission.csv.from_start=true", "start.spacing_m=2", "swarm.agents=5")
+    assert said[0].startswith(
+        "agent 0: the reference begins 2.50 m from its start (at -4, 0, -4.5, start -4, 0, -2); mission.csv.from_start"
+    )
+    assert len(said) == 4
+    assert said[-1].startswith("2 more")
+    timed = "mission.waypoints.lists=[{points_ned_m=[[9, 0, 0], [9, 1, 0]], times_s=[0, 9]}"
+    timed = f"{timed}, {{points_ned_m=[[2, 0, 0], [2, 1, 0]], times_s=[0, 9]}}]"
+    (own,) = lines("swarm.agents=2", "start.spacing_m=4", "mission.kind=waypoints", timed)
+    assert own.startswith("agent 0: the reference begins 11.00 m from its start")
+    assert "from_start" not in own
+
+
+def test_negative_control_one_that_begins_there_or_is_shared_is_not(tmp_path: Path) -> None:
+    assert begins_at(tmp_path, -0.4, "mission.csv.from_start=true") == []
+    assert begins_at(tmp_path, -2.5) == [], "agents that share a reference fly to it"
+
+
+def test_a_script_is_warned() -> None:
+    with pytest.warns(UserWarning, match="mission.goto is set, mission.kind is 'hover'") as caught:
+        swarmctl.load(set={"mission.kind": "hover", "mission.goto.goals_ned_m": [[4.0, 0.0, -1.0]]})
+    assert caught[0].filename == __file__, "it points at the script"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        swarmctl.load()

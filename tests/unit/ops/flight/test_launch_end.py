@@ -1,0 +1,139 @@
+"""What verbs say of a launch whose agents have ended, while it writes its report."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from swarmctl.bus.local.hub import LocalHub
+from swarmctl.bus.topics import OPERATOR
+from swarmctl.bus.zenoh_bus import SCHEME
+from swarmctl.config import Config
+from swarmctl.core.operator_verbs import Order
+from swarmctl.errors import StartError
+from swarmctl.ops.flight import launch as launching
+from swarmctl.ops.flight.launch import Launcher, LaunchOptions, SwarmPart, judged
+from swarmctl.ops.flight.launch_result import LaunchResult
+from swarmctl.ops.flight.preflight import ReservedPorts
+from swarmctl.ops.orders import obstacle_list, operator, order_delivery
+from swarmctl.ops.orders.obstacle_list import read_obstacles
+from swarmctl.ops.orders.operator import RunningLaunch, announce, find_launch, joined, read_statuses
+from swarmctl.ops.orders.order_delivery import deliver
+
+ENDING = r"circle.* is ending: nobody answers any more, it writes its report to .*run"
+
+
+@pytest.fixture
+def launch(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> RunningLaunch:
+    """Return a launch of this process, which flies."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    started_s, pid = operator.process_start_s()
+    (tmp_path / "run").mkdir()
+    flies = RunningLaunch("circle-1a", f"{SCHEME}{tmp_path}/bus.sock", pid, started_s, 3, str(tmp_path / "run"))
+    announce(flies)
+    return flies
+
+
+def end(launch: RunningLaunch) -> None:
+    announce(msgspec.structs.replace(launch, ending=True))
+
+
+def no_router(*given: Any, **named: Any) -> Any:
+    raise StartError("no router answers")
+
+
+def nobody(*given: Any, **named: Any) -> Any:
+    return LocalHub(lambda: 0).connect(OPERATOR)
+
+
+def test_verbs_say_that_a_launch_is_ending(launch: RunningLaunch) -> None:
+    end(launch)
+    for name in (None, "circle", launch.run_dir):
+        with pytest.raises(StartError, match=ENDING):
+            find_launch(name)
+
+
+def test_a_launch_that_is_ending_is_not_in_the_way_of_one_that_flies(
+    launch: RunningLaunch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = msgspec.structs.replace(launch, run="circle-2b", pid=os.getppid(), run_dir=f"{launch.run_dir}/other")
+    monkeypatch.setattr(operator, "_runs", lambda launch: True)
+    announce(other)
+    end(launch)
+    assert find_launch(None) == other
+    assert find_launch("circle") == other
+
+
+def test_a_verb_that_finds_a_launch_in_its_last_moment_says_that_it_is_ending(
+    launch: RunningLaunch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(operator, "ANSWER_S", 0.0)
+    monkeypatch.setattr(order_delivery, "ANSWER_S", 0.0)
+    monkeypatch.setattr(obstacle_list, "ANSWER_S", 0.0)
+    for bus in (nobody, no_router):
+        monkeypatch.setattr(operator, "join_bus", bus)
+        announce(launch)
+        if bus is nobody:  # it is late, and still there
+            assert read_statuses(launch) == {}
+            assert {reply.answer for reply in deliver(launch, Order("hold"), [])} == {None}
+        end(launch)
+        with pytest.raises(StartError, match=ENDING):
+            read_statuses(launch)
+        with pytest.raises(StartError, match=ENDING):
+            deliver(launch, Order("hold"), [])
+        with pytest.raises(StartError, match=ENDING):
+            read_obstacles(launch)
+    announce(launch)
+    with pytest.raises(StartError, match="no router answers"), joined(launch):
+        pass
+
+
+def launcher(folder: Path) -> Launcher:
+    ports = ReservedPorts(sockets=(), ports=(), view_port=0)
+    return Launcher(Config(), LaunchOptions(), ports, folder, part=SwarmPart(run="circle-1a", agents=()))
+
+
+def test_a_launch_is_ending_from_the_end_of_its_agents_until_its_report_is_written(
+    launch: RunningLaunch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    order: list[str] = []
+
+    def ended(*given: object) -> bool:
+        try:
+            order.append(find_launch(launch.run_dir).run)
+        except StartError as error:
+            order.append("ending" if "is ending" in str(error) else str(error))
+        return False
+
+    monkeypatch.setattr(launching, "end_all", ended)
+    monkeypatch.setattr(launching, "sum_up", ended)
+    services = launcher(tmp_path / "run")
+    services.announce("")
+    services.stop(0.0)
+    assert judged(Config(), services, LaunchResult()) == 0
+    agents, others, router, report = order
+    assert agents == "circle-1a"
+    assert (others, router, report) == ("ending",) * 3
+    with pytest.raises(StartError, match="no launch runs"):
+        find_launch(None)
+
+
+def test_an_end_that_can_not_be_announced_is_one_all_the_same(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def no_descriptor(note: RunningLaunch) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    ended: list[object] = []
+    monkeypatch.setattr(launching, "end_all", lambda children, grace_s: ended.append(children))
+    services = launcher(tmp_path)
+    monkeypatch.setattr(launching, "announce", lambda note: None)
+    services.announce("")
+    monkeypatch.setattr(launching, "announce", no_descriptor)
+    services.stop(0.0)
+    assert len(ended) == 3, "agents, others, router"

@@ -1,0 +1,93 @@
+"""The result of a flight is printed whatever happens to the disk it was recorded on."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from swarmctl.config import Config, dump
+from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
+from tests.unit.telemetry.test_run_folder import RULES, write_run
+
+# What the launcher does after all agents have landed; `limit` is the largest file the system lets it write.
+_SUM_UP = """
+import resource, sys
+from pathlib import Path
+from swarmctl.config import Config
+from swarmctl.ops.flight.launch_result import LaunchResult
+from swarmctl.ops.flight.summary import sum_up
+directory, limit = Path(sys.argv[1]), int(sys.argv[2])
+if limit >= 0:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+result = LaunchResult(problems=["agent-1 was killed by SIGKILL", "agent-2 has been silent for 5 s"])
+violated = sum_up(Config(), directory, result, print)
+print("exit code", result.exit_code(violated))
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A flight of three, landed, not judged yet."""
+    write_run(tmp_path, 3, 6.0)
+    (tmp_path / "config.toml").write_text(dump(Config()))
+    return tmp_path
+
+
+def sum_up(folder: Path, limit: int) -> list[str]:
+    command = [sys.executable, "-c", _SUM_UP, str(folder), str(limit)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.splitlines()
+
+
+def test_a_full_disk_costs_the_files_and_not_the_verdict(folder: Path) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    lines = sum_up(folder, 0)
+    assert lines[:2] == ["violation: agent-1 was killed by SIGKILL", "violation: agent-2 has been silent for 5 s"]
+    result, separation, *_ = (line for line in lines if not line.startswith("violation: "))
+    assert result.startswith("failed, summed mean tracking error")
+    assert separation.startswith("separation 1.039 m (required 0.850 m)")
+    assert f"run folder {folder}" in lines
+    assert "summary.json: File too large" in lines[-2]
+    assert f"swarmctl report {folder}" in lines[-2]
+    assert lines[-1] == "exit code 4"
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+_REPORT = """
+import resource, sys
+from swarmctl.ops.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+sys.argv = ["swarmctl", "report", sys.argv[1]]
+main()
+"""
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_report_that_a_full_disk_does_not_take_is_an_error(folder: Path, finished: bool) -> None:
+    if finished:
+        finish_run(folder, RULES, Outcome(outcome="completed"))
+    command = [sys.executable, "-c", _REPORT, str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (3, "")
+    [line] = done.stderr.splitlines()
+    assert "report.html" in line and "File too large" in line
+
+
+def test_a_disk_that_fills_on_the_way_keeps_what_fits(folder: Path) -> None:
+    lines = sum_up(folder, 30_000)  # the report does not fit
+    assert "report.html" in lines[-2]
+    assert "summary.json" not in lines[-2]
+    assert (folder / "summary.json").exists()
+    assert not list(folder.glob("*.part"))
+
+
+def test_a_recording_that_cannot_be_judged_costs_the_figures_and_not_the_verdict(folder: Path) -> None:
+    (folder / "truth.bin").unlink()
+    (folder / "truth.bin").mkdir()
+    lines = sum_up(folder, -1)
+    assert lines[:2] == ["violation: agent-1 was killed by SIGKILL", "violation: agent-2 has been silent for 5 s"]
+    assert lines[2].startswith("failed, ")
+    assert "can't be judged" in lines[-2]
+    assert lines[-1] == "exit code 4"
