@@ -56,7 +56,6 @@ class Field:
 
 
 Fielder = Callable[..., Field]
-FLEET = 2  # vehicles and more, which need most of a processor
 LOOK_S = 0.2
 
 
@@ -80,8 +79,7 @@ def field(network: Network, tmp_path: Path, tmp_path_factory: pytest.TempPathFac
         is_alone: bool = False,
     ) -> Field:
         require(kind, network, count)
-        if count >= FLEET:
-            turns.enter_context(turn(tmp_path_factory.getbasetemp().parent, is_alone))
+        turns.enter_context(turn(tmp_path_factory.getbasetemp().parent, is_alone))
         fleet = Fleet(kind, count, network, tmp_path / "vehicles", parameters)
         fields.append(Field(fleet, Witness(fleet, on_truth), tmp_path))
         return fields[-1]
@@ -94,13 +92,13 @@ def field(network: Network, tmp_path: Path, tmp_path_factory: pytest.TempPathFac
 
 @contextlib.contextmanager
 def turn(shared: Path, is_alone: bool) -> Iterator[None]:
-    """Wait until fewer fleets are in the air than this machine has processors: lanes share that folder.
+    """Wait until fewer flights are in the air than this machine has processors: lanes share that folder.
 
-    A fleet that has to fly accurately or without overload waits until there is no other: two of them, each with its
-    agents, take turns of the processors, and what is measured then is how late their ticks are.
+    One that has to be accurate or complete waits until there is no other: two of them, each with its agents, take turns
+    of the processors, and what is measured then is how late their ticks are.
     """
     with contextlib.ExitStack() as stack:
-        names = [shared / f"fleet-{i}.lock" for i in range(len(os.sched_getaffinity(0)))]
+        names = [shared / f"flight-{i}.lock" for i in range(len(os.sched_getaffinity(0)))]
         files = [stack.enter_context(name.open("w")) for name in names]
         wanted = [[file] for file in files] if is_alone else [files]  # each of them, or any one
         for choice in wanted:
