@@ -186,7 +186,7 @@ def run(options: argparse.Namespace) -> int:
         written = [write(rows, options.out)]
     if note:
         console.print(note)
-    console.print("\n".join(map(str, written)), markup=False)
+    console.print("\n".join(map(str, written)), markup=False, soft_wrap=True)
     return EXIT_OK
 
 
