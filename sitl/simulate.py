@@ -19,7 +19,7 @@ from rich.progress import Progress
 
 from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
-from swarmctl.configuration.doubts import warning_lines
+from swarmctl.configuration.config_warnings import warning_lines
 from swarmctl.configuration.view import viewed_flight
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
 from swarmctl.files import replace_bytes, replace_text, write_each

@@ -1,7 +1,7 @@
 """Configuration of a whole run: one frozen tree, read from TOML. An invalid one is refused with all its problems.
 
 Parameter classes live beside the code that uses them. This module composes them, has constraints between
-sections checked (`config_constraints`), and writes the resolved copy. It opens no sockets and starts nothing.
+sections checked (`configuration.constraints`), and writes the resolved copy. It opens no sockets and starts nothing.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Writes the table of recorded columns into `docs/data_formats.md` from their declaration, `core.tick_record.COLUMNS`.
+"""Writes the table of recorded columns into `docs/data_formats.md` from `COLUMNS` of `core.recorded.tick_record`.
 
 `python tools/recorded_columns.py`. A test compares the page with what this writes.
 """

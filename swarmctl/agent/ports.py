@@ -23,7 +23,7 @@ class TickSink(Protocol):
     """Destination of ticks and events; its methods never block."""
 
     def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
-        """Take the row of a tick, a (1,) array of `core.records.TICK_DTYPE`."""
+        """Take the row of a tick, a (1,) array of `core.recorded.records.TICK_DTYPE`."""
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None: ...
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from swarmctl.config import NO_VALUES, Config
 from swarmctl.config import load as load_config
-from swarmctl.configuration.doubts import config_warnings
+from swarmctl.configuration.config_warnings import config_warnings
 
 __all__ = ["Config", "load"]
 

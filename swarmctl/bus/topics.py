@@ -1,7 +1,7 @@
 """The topics of the bus: one table. A bus delivers no message that is too long for its topic.
 
 Their messages are laid out in `path_messages.py`, `commitment_messages.py`, `relay.py` and `json_messages.py`; ticks
-are rows of `core.records`.
+are rows of `core.recorded.records`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The record of one tick, and the one table of what is recorded of it.
 
 A row of `COLUMNS` is everything there is to say about a recorded value: its name (with the unit), type, meaning, how it
-follows from the tick, and where the view shows it. The bytes on the bus and in run files (`core.records`), the columns
+follows from the tick, and where the view shows it. The bytes on the bus and in run files (`records`), the columns
 and metadata of Parquet, the table in `docs/data_formats.md`, and the curves of view and report all derive from it.
 """
 

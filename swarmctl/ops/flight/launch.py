@@ -26,7 +26,7 @@ from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
 from swarmctl.bus.topics import OBSTACLES, OPERATOR, STATUS, TICK, Topic
 from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, socket_file
 from swarmctl.config import Config, dump
-from swarmctl.configuration.doubts import warning_lines
+from swarmctl.configuration.config_warnings import warning_lines
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text
 from swarmctl.ops.flight.launch_result import LaunchResult

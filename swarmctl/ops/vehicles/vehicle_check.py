@@ -22,7 +22,7 @@ from swarmctl.check.services import corners_deg, has_fence, wants_fence
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import as_json, print_check
 from swarmctl.config import Config
-from swarmctl.configuration.doubts import warning_lines
+from swarmctl.configuration.config_warnings import warning_lines
 from swarmctl.errors import StartError
 from swarmctl.ops.vehicles.vehicle_links import VehicleLinks, open_links
 from swarmctl.process_lifetime import StopRequest

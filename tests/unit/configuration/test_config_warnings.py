@@ -9,7 +9,7 @@ import pytest
 
 import swarmctl
 from swarmctl.config import dump, load, load_mission
-from swarmctl.configuration.doubts import config_warnings, warning_lines
+from swarmctl.configuration.config_warnings import config_warnings, warning_lines
 from swarmctl.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]
