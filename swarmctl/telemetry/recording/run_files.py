@@ -1,9 +1,9 @@
 """Reads and writes the files of a run folder. A folder may come from another person, so its content is validated.
 
-Formats: `agent-<i>.ticks`, `agent-<i>.plans` and `truth.bin` are raw rows of `core.recorded.records`, as they are written
-in flight; `agent-<i>.parquet`, `agent-<i>.plans.parquet` and `truth.parquet` are the same tables with vectors expanded to
-one column per component. A partial last row, left by a killed process, is ignored. Anything but a regular file of
-bounded size and expected content is refused with a reason.
+Formats: `agent-<i>.ticks`, `agent-<i>.plans` and `truth.bin` are raw rows of `core.recorded.records`, as they are
+written in flight; `agent-<i>.parquet`, `agent-<i>.plans.parquet` and `truth.parquet` are the same tables with vectors
+expanded to one column per component. A partial last row, left by a killed process, is ignored. Anything but a regular
+file of bounded size and expected content is refused with a reason.
 """
 
 from __future__ import annotations
