@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from swarmctl.errors import ConfigError, StartError
+
 _CREATE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -142,3 +144,21 @@ def write_each(writers: Mapping[str, Callable[[], object]]) -> tuple[str, ...]:
         except OSError as error:
             unwritten.append(f"{name}: {error.strerror or error}")
     return tuple(unwritten)
+
+
+def write_new(texts: Mapping[Path, str]) -> None:
+    """Write files that do not exist yet: all or none.
+
+    Raises:
+        ConfigError: there is one.
+        StartError: one can't be written.
+    """
+    for path in texts:
+        if os.path.lexists(path):
+            raise ConfigError(str(path), ["exists already; give another name, or go to another folder"])
+    for path, text in texts.items():
+        try:
+            with path.open("x", encoding="utf-8") as file:
+                file.write(text)
+        except OSError as error:
+            raise StartError(f"{path}: can't be written: {error.strerror}") from error

@@ -13,6 +13,11 @@ def monotonic_us() -> int:
     return time.monotonic_ns() // 1000
 
 
+def utc_us() -> int:
+    """Return UTC as the host has it at this moment [us]."""
+    return time.time_ns() // 1000
+
+
 class WallClock:
     """Reads the host's clocks. UTC steps are slewed, so that in flight time neither jumps nor runs backwards.
 
@@ -31,12 +36,20 @@ class WallClock:
         return self._monotonic_ns() // 1000
 
     def utc_us(self) -> int:
+        return self._discipline() // 1000
+
+    def utc_of_us(self, t_us: int) -> int:
+        self._discipline()
+        return (1000 * t_us + self._offset_ns) // 1000
+
+    def _discipline(self) -> int:
+        """Follow the host's UTC; return it [ns]."""
         now_ns = self._monotonic_ns()
         most_ns = int((now_ns - self._read_ns) * _UTC_SLEW_01)
         off_ns = self._utc_ns() - now_ns - self._offset_ns
         self._offset_ns += off_ns if -most_ns <= off_ns <= most_ns else most_ns if off_ns > 0 else -most_ns
         self._read_ns = now_ns
-        return (now_ns + self._offset_ns) // 1000
+        return now_ns + self._offset_ns
 
     def sleep_until(self, t_us: int) -> None:
         """Return at monotonic time `t_us`, or at once when it has passed."""

@@ -31,7 +31,7 @@ import psutil
 
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
-from swarmctl.ops.flight.preflight import claim_ports
+from swarmctl.ops.preflight import claim_ports
 
 PHASES = ("CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "HOLD", "GOTO_LAND", "LAND")
 STOPS = ("sigint", "sigterm", "sighup", "land", "kill-agent", "kill-router", "kill-launcher")

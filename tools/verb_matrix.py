@@ -28,8 +28,9 @@ from swarmctl.bus.topics import STATUS
 from swarmctl.core.operator_verbs import BEGIN, EXCLUDE, GOTO, MISSION, OPERATOR_VERBS, PEER, POINT, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import StartError
-from swarmctl.ops.orders.operator import LAUNCH_FILE, RunningLaunch, find_launch, joined
+from swarmctl.ops.orders.operator import joined
 from swarmctl.ops.orders.order_delivery import Reply, deliver
+from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch, find_launch
 
 AGENTS = 2
 _MISSION = MissionMessage(mission=7, text='{"kind": "hover", "duration_s": 40.0}')

@@ -179,12 +179,13 @@ class Agent:
         Returns:
             the record of the tick, already handed to the sink.
         """
+        # What a tick decides and records is of `now_us`, in UTC too, also where it is held up on the way.
         stopwatch_ns = self._ports.stopwatch_ns
         began_ns = stopwatch_ns()
         self._deadlines.update(now_us, deadline_misses, self._ports.autopilot.setpoint_loss_s)
         self._receive(now_us)
         state = self._sense(now_us)
-        self._state_machine.begin_if_due(now_us, self._ports.clock.utc_us())
+        self._state_machine.begin_if_due(now_us, self._ports.utc_of_us(now_us))
         sensed_ns = stopwatch_ns()
         planning = self._planner.plan(now_us, state)
         planned_ns = stopwatch_ns()

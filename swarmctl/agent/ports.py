@@ -45,4 +45,4 @@ class Ports:
 
     def utc_of_us(self, t_us: int) -> int:
         """Convert monotonic time of this process to UTC [us]."""
-        return self.clock.utc_us() + t_us - self.clock.now_us()
+        return self.clock.utc_of_us(t_us)

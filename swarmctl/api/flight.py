@@ -22,8 +22,9 @@ from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.errors import ConfigError, MissionError, StartError
 from swarmctl.files import read_file, replace_text
 from swarmctl.ops.orders.mission_file import set_mission
-from swarmctl.ops.orders.operator import LAUNCH_FILE, RunningLaunch, read_statuses
+from swarmctl.ops.orders.operator import read_statuses
 from swarmctl.ops.orders.order_delivery import Reply, deliver
+from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
 from swarmctl.telemetry.recording.run_files import CONFIG
 from swarmctl.telemetry.recording.run_folder import create_run_folder
 

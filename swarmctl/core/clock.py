@@ -19,6 +19,9 @@ class Clock(Protocol):
     def utc_us(self) -> int:
         """Return disciplined UTC [us since 1970], comparable between hosts."""
 
+    def utc_of_us(self, t_us: int) -> int:
+        """Return UTC at monotonic time `t_us`. No hold-up of this process comes between two readings: there is one."""
+
 
 class SimClock:
     """Simulated time, which moves only by `advance`. Both clocks tick together, `epoch_us` apart."""
@@ -32,6 +35,9 @@ class SimClock:
 
     def utc_us(self) -> int:
         return self._epoch_us + self._now_us
+
+    def utc_of_us(self, t_us: int) -> int:
+        return self._epoch_us + t_us
 
     def advance(self, step_us: int) -> None:
         """Advance time by `step_us` (> 0)."""
@@ -59,5 +65,8 @@ class OffsetClock:
         return self._clock.now_us()
 
     def utc_us(self) -> int:
-        drift_us = round(1e-6 * self._error.drift_ppm * self._clock.now_us())
-        return self._clock.utc_us() + self._error.offset_us + drift_us
+        return self.utc_of_us(self._clock.now_us())
+
+    def utc_of_us(self, t_us: int) -> int:
+        drift_us = round(1e-6 * self._error.drift_ppm * t_us)
+        return self._clock.utc_of_us(t_us) + self._error.offset_us + drift_us

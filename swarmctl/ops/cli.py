@@ -28,7 +28,7 @@ from swarmctl.ops.verbs.orders import AsJson, Run, add_order_verbs
 
 if TYPE_CHECKING:
     from swarmctl.bus.messages.json_messages import StatusMessage
-    from swarmctl.ops.orders.operator import RunningLaunch
+    from swarmctl.ops.running_launches import RunningLaunch
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -231,9 +231,10 @@ def status(
     watch: Annotated[bool, typer.Option("--watch", help="Go on until the launch ends, or Ctrl-C.")] = False,
 ) -> int:
     """Show the status of every agent of a running launch."""
+    from swarmctl.ops import running_launches
     from swarmctl.ops.orders import operator
 
-    launch = operator.find_launch(run)
+    launch = running_launches.find_launch(run)
     if watch:
         with contextlib.suppress(KeyboardInterrupt):
             _watch(launch, as_json)
@@ -284,10 +285,10 @@ def fault(
     as_json: AsJson = False,
 ) -> int:
     """Inject a fault into the simulator of a running launch. Refused where real vehicles fly."""
+    from swarmctl.ops import running_launches
     from swarmctl.ops.orders import fault as faults
-    from swarmctl.ops.orders import operator
 
-    launch = operator.find_launch(run)
+    launch = running_launches.find_launch(run)
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
     asked = faults.parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
     since_boot_s = faults.inject(launch, asked)
@@ -301,10 +302,11 @@ def fault(
 @app.command()
 def view(run: Run = None, web: Web = False) -> int:
     """Open the live view of a running launch."""
+    from swarmctl.ops import running_launches
     from swarmctl.ops.orders import operator
     from swarmctl.telemetry.view.recordings import open_viewer
 
-    address = operator.view_address(operator.find_launch(run))
+    address = operator.view_address(running_launches.find_launch(run))
     if web:
         return show_in_browser(address)
     open_viewer(address)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import difflib
 import json
-import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from swarmctl.built_in_configs import EXAMPLES, built_in_files
 from swarmctl.config import Config
 from swarmctl.configuration.keys import Key, Section, meanings, model_in, sections, value_text
 from swarmctl.core.params import Params
-from swarmctl.errors import ConfigError, StartError
+from swarmctl.errors import ConfigError
 
 DEFAULTS = "defaults"  # name of the file of all keys
 _ITEM = ".N."
@@ -183,21 +182,3 @@ def _commented_key(key: Key) -> str:
     value = "..." if key.default is None else value_text(key.default)
     about = "; ".join(filter(None, (key.meaning, key.kind, key.allowed, "required" if key.is_required else "")))
     return f"#{key.name} = {value}  # {about}\n".replace("`", "")
-
-
-def write_new(texts: Mapping[Path, str]) -> None:
-    """Write files that do not exist yet: all or none.
-
-    Raises:
-        ConfigError: there is one.
-        StartError: one can't be written.
-    """
-    for path in texts:
-        if os.path.lexists(path):
-            raise ConfigError(str(path), ["exists already; give another name, or go to another folder"])
-    for path, text in texts.items():
-        try:
-            with path.open("x", encoding="utf-8") as file:
-                file.write(text)
-        except OSError as error:
-            raise StartError(f"{path}: can't be written: {error.strerror}") from error

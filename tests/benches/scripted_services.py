@@ -16,8 +16,8 @@ from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, OPERATOR, STATUS
 from swarmctl.config import load
 from swarmctl.core.operator_verbs import EXCLUDE, PEER
 from swarmctl.core.types import Phase
-from swarmctl.ops.flight.launch_result import LaunchResult
-from swarmctl.ops.flight.processes import ROUTER, Child, Command, RunContext, kill_all
+from swarmctl.ops.processes import ROUTER, Child, Command, RunContext, kill_all
+from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.ops.supervision.status_table import AgentView
 from swarmctl.ops.supervision.supervisor import FlightSupervisor, Services
 from swarmctl.telemetry.recording.event_log import EventLog

@@ -316,7 +316,7 @@ ROWS = (
         protection="pre-flight check of the vehicles' links",
         script=ports_taken,
         readable=False,
-        off=in_program("launch", "import swarmctl.ops.flight.preflight as it\nit._vehicle_problems = lambda *_: ()"),
+        off=in_program("launch", "import swarmctl.ops.preflight as it\nit._vehicle_problems = lambda *_: ()"),
     ),
     LaunchedRow(
         name="start-vehicle-missing",

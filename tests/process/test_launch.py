@@ -25,8 +25,8 @@ from swarmctl.core.types import Phase
 from swarmctl.mavlink.signing.key_file import write_new_key
 from swarmctl.mavlink.signing.refusals import OLD, REPLAYED
 from swarmctl.ops.cli import main
-from swarmctl.ops.flight.processes import wants_realtime
-from swarmctl.ops.orders.operator import LAUNCH_FILE
+from swarmctl.ops.processes import wants_realtime
+from swarmctl.ops.running_launches import LAUNCH_FILE
 from swarmctl.process_priority import is_realtime_permitted
 from swarmctl.telemetry.recording.run_files import read_parquet
 from tests.benches.at_once import at_once

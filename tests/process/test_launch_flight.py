@@ -20,7 +20,7 @@ from swarmctl.bus.traffic import CountedBus
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
-from swarmctl.ops.flight.processes import ROUTER, SITL, VIEWER, Child
+from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child
 from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles

@@ -64,13 +64,13 @@ class OperatorOrders:
         if order.verb == EXCLUDE:
             self._world_model.exclude(int(order.arguments[PEER]))
             return ""
-        refusal = self._offer_mission(order) if order.verb == MISSION else ""
+        refusal = self._offer_mission(order, now_us) if order.verb == MISSION else ""
         state = self._ports.autopilot.poll(now_us)
-        return refusal or self._state_machine.operator(order, now_us, self._ports.clock.utc_us(), state)
+        return refusal or self._state_machine.operator(order, now_us, self._ports.utc_of_us(now_us), state)
 
-    def _offer_mission(self, order: Order) -> str:
+    def _offer_mission(self, order: Order, now_us: int) -> str:
         """Have the state machine know the mission of an order; return why it is not flown, or ""."""
-        offered = self._missions.offer(order, self._ports.clock.utc_us())
+        offered = self._missions.offer(order, self._ports.utc_of_us(now_us))
         if isinstance(offered, str):
             return offered
         self._state_machine.mission.offered = offered

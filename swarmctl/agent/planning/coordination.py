@@ -11,7 +11,8 @@ import numpy as np
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.commitment_messages import PeerTrajectories, encode_trajectory_message
+from swarmctl.bus.messages.commitment_messages import encode_trajectory_message
+from swarmctl.bus.peer_trajectories import PeerTrajectories
 from swarmctl.bus.relay import missed_by_peers
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams

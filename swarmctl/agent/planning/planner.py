@@ -121,7 +121,7 @@ class Planner:
 
     def _separate(self, now_us: int, state: VehicleState, keep_outs: KeepOuts, controls: bool) -> SeparationDirective:
         """Return this tick's directive; its reference begins where the setpoint acts."""
-        utc_us = self._utc_of_us(now_us)  # of the tick: a tick can be held up before this line
+        utc_us = self._utc_of_us(now_us)
         if not controls or self._modes.mode in _DEVIATING_MODES:
             return self._separation.idle(utc_us, state, keep_outs)
         return self._separation.step(

@@ -73,8 +73,7 @@ class TelemetryPublisher:
     ) -> TickRecord:
         """Return the record of one tick; the setpoint has been sent before."""
         self.seq += 1
-        # a tick can be held up for 30 ms in its middle: the state's time in UTC is that of its beginning
-        utc_us = self._clock.utc_us() + now_us - self._clock.now_us()
+        utc_us = self._clock.utc_of_us(now_us)
         battery_01 = self._autopilot.health.battery_01
         peers, obstacles, age_ms = self._distances(planning, utc_us - now_us)
         return TickRecord(

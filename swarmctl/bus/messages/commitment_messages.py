@@ -1,4 +1,4 @@
-"""Trajectory messages of `swarmctl.control.commit.protocol`: their encoding, and the newest one of every peer.
+"""Trajectory messages of `swarmctl.control.commit.protocol`: their encoding.
 
 The layout is little-endian: a header, the committed trajectory, a proposal if there is one, acknowledgements (agent,
 number), what was heard (agent, stamp, arrival), and the numbers of agents that are suspected, then of those to be
@@ -8,16 +8,9 @@ excluded. A trajectory is t0, step and count, then positions and velocities as f
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
 
 import numpy as np
 
-from swarmctl.bus.bus import agent_name
-from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import MAX_LEAD_US, peer_verifiers
-from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Presence, ReceivedMessage
-from swarmctl.bus.topics import TRAJECTORY
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
 from swarmctl.core.types import Array
@@ -26,9 +19,6 @@ TRAJECTORY_VERSION = 4
 MAX_TUBE_M = 100.0
 MAX_POINTS = 2000
 MAX_STEP_US = 500_000
-MAX_BEGIN_US = 10_000_000  # from now; a trajectory that begins later comes from another clock
-MAX_CLOCK_ERROR_US = 10_000_000  # a clock known less well is known as badly; nothing is committed then
-_BETTER_01 = 0.5  # share of the error of a clock at which trajectories are decoded anew
 MAX_PEERS = 256  # of each kind: acknowledged, heard, suspected, promised
 _MAGIC = b"SI"
 _HEADER = struct.Struct("<2sBBIIIqfHHHH")  # magic version flags agent boot seq sent tube, counts of the four kinds
@@ -161,76 +151,3 @@ def _decode_trajectory(
         clock_error_us=error_us,
     )
     return sent[body], end
-
-
-class PeerTrajectories:
-    """Keeps the newest valid message of every peer, whatever its age.
-
-    Args:
-        peers: numbers of the other agents.
-        rate_hz, refusals, presence: see `SenderVerifier`.
-        agent: own number, under which peers answer.
-        clocks: measured on the messages, by which trajectories are converted to the own clock.
-    """
-
-    def __init__(
-        self,
-        peers: Iterable[int],
-        rate_hz: float,
-        refusals: Refusals,
-        presence: Presence,
-        *,
-        agent: int,
-        clocks: PeerClocks,
-    ) -> None:
-        self._verifiers = peer_verifiers(peers, TRAJECTORY, rate_hz, refusals, presence=presence)
-        self._refusals, self._agent, self._clocks = refusals, agent, clocks
-        self._numbers = {agent_name(agent): agent for agent in self._verifiers}
-        self._memory: dict[str, Memory] = {}
-        self._used_error_us: dict[str, int] = {}  # of the clock of each peer, since its trajectories were decoded anew
-        self.newest: dict[int, TrajectoryMessage] = {}
-        self.received_utc_us: dict[int, int] = {}  # when the newest message of each peer was accepted
-        self.heard_before_flight: set[int] = set()  # peers that did not fly by commitments when first heard
-
-    def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
-        """Check one message and keep it if it is accepted; the bus guarantees the name `sender`, `utc_us` is now."""
-        number = self._numbers.get(sender, -1)
-        memory, ahead_us = dict(self._memory.get(sender, {})), self._clocks.ahead_us(number)
-        error_us = min(self._clocks.error_us(number), MAX_CLOCK_ERROR_US) if number in self._verifiers else 0
-        message = decode_trajectory_message(payload, memory, ahead_us, error_us)
-        if message is None or (reason := self._refusal(sender, message, utc_us)):
-            self._refusals.add(sender, TRAJECTORY.name, MALFORMED if message is None else reason, utc_us)
-            return
-        sent = ReceivedMessage(message.boot_id, message.seq, min(message.sent_utc_us, utc_us + MAX_LEAD_US), payload)
-        verifier = self._verifiers[message.agent]
-        if verifier.is_past(sent):
-            return  # a relay, or the sender itself, was slower than another way
-        if verifier.accepts(sent, utc_us):
-            if message.agent not in self.newest and not message.is_committed:
-                self.heard_before_flight.add(message.agent)
-            self.newest[message.agent], self._memory[sender] = message, memory
-            self.received_utc_us[message.agent] = utc_us
-            self._measure(message, utc_us)
-            is_better = self._clocks.error_us(message.agent) < _BETTER_01 * self._used_error_us.get(sender, error_us)
-            if self._clocks.ahead_us(message.agent) != ahead_us or is_better:
-                self._memory[sender] = {}
-                self._used_error_us.pop(sender, None)
-            else:
-                self._used_error_us.setdefault(sender, error_us)
-
-    def heard(self) -> dict[int, tuple[int, int]]:
-        """Return stamp and arrival of the newest message of each peer."""
-        return {agent: (i.sent_utc_us, self.received_utc_us[agent]) for agent, i in self.newest.items()}
-
-    def _measure(self, message: TrajectoryMessage, utc_us: int) -> None:
-        self._clocks.received(message.agent, message.sent_utc_us, utc_us)
-        if self._agent in message.heard:
-            self._clocks.answered(message.agent, *message.heard[self._agent], utc_us)
-
-    def _refusal(self, sender: str, message: TrajectoryMessage, utc_us: int) -> str:
-        if sender != agent_name(message.agent):
-            return IDENTITY
-        if message.agent not in self._verifiers:
-            return UNKNOWN_PEER
-        begins_us = max(trajectory.t0_utc_us for trajectory in message.trajectories)
-        return FUTURE if begins_us > utc_us + MAX_BEGIN_US else ""

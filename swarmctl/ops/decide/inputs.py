@@ -56,6 +56,9 @@ class RecordedTime:
     def utc_us(self) -> int:
         return self.utc
 
+    def utc_of_us(self, t_us: int) -> int:
+        return self.utc + t_us - self.t_us
+
 
 class RecordedLink:
     """A link whose vehicle says what it has said."""

@@ -1,6 +1,6 @@
 """The launcher: runs the preflight, starts the processes, supervises the flight, stops all processes, and sums up.
 
-`swarmctl.ops.supervision` watches the flight, and `swarmctl.ops.flight.preflight` decides whether it may start. In
+`swarmctl.ops.supervision` watches the flight, and `swarmctl.ops.preflight` decides whether it may start. In
 every case all processes, sockets and ports that were started here end with this module.
 """
 
@@ -29,9 +29,10 @@ from swarmctl.config import Config, dump
 from swarmctl.configuration.config_warnings import warning_lines
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text
-from swarmctl.ops.flight.launch_result import LaunchResult
-from swarmctl.ops.flight.preflight import LOOPBACK, ReservedPorts, inspect
-from swarmctl.ops.flight.processes import (
+from swarmctl.ops.flight.summary import sum_up
+from swarmctl.ops.orders.operator import list_keepers
+from swarmctl.ops.preflight import LOOPBACK, ReservedPorts, inspect
+from swarmctl.ops.processes import (
     ROUTER,
     Child,
     Command,
@@ -44,13 +45,14 @@ from swarmctl.ops.flight.processes import (
     viewer_command,
     wants_realtime,
 )
-from swarmctl.ops.flight.summary import sum_up
-from swarmctl.ops.orders.operator import RunningLaunch, announce, list_keepers, process_start_s, utc_us, withdraw
+from swarmctl.ops.running_launches import RunningLaunch, announce, process_start_s, withdraw
+from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.ops.supervision.status_table import open_display
 from swarmctl.ops.supervision.supervisor import FlightSupervisor, Services
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.process_priority import is_realtime_permitted
 from swarmctl.telemetry.recording.event_log import EventLog
+from swarmctl.wall_clock import utc_us
 
 _BUS_S = 20.0  # timeout for the router to answer
 _BUS_TRY_MS = 500

@@ -24,9 +24,9 @@ from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.flight.host import refuse_unidentified, shared_run_name
 from swarmctl.ops.flight.launch import LaunchOptions, SwarmPart, judged, started
-from swarmctl.ops.flight.launch_result import LaunchResult
-from swarmctl.ops.flight.processes import ROUTER, VIEWER
+from swarmctl.ops.processes import ROUTER, VIEWER
 from swarmctl.ops.supervision.bus_report import BusReport
+from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.ops.supervision.status_table import AgentView, Display, tell
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
 from swarmctl.process_lifetime import StopRequest

@@ -9,7 +9,7 @@ from typing import Any
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
 from swarmctl.mavlink.signing.refusals import HARMLESS
-from swarmctl.ops.flight.launch_result import LaunchResult
+from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 
 _MISSED_SHOWN = 5  # agents that are named because they have not reached their goals

@@ -16,8 +16,8 @@ from typing import Any
 from swarmctl.config import load_recorded
 from swarmctl.configuration.problems import validated
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.ops.flight.processes import control_socket
-from swarmctl.ops.orders.operator import RunningLaunch
+from swarmctl.ops.processes import control_socket
+from swarmctl.ops.running_launches import RunningLaunch
 from swarmctl.simulator_config import FAULTS, FaultParams
 
 _ANSWER_S = 3.0

@@ -14,8 +14,9 @@ from swarmctl.config import load_mission, load_recorded
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.operator_verbs import BEGIN, MISSION, Order
 from swarmctl.errors import ConfigError
-from swarmctl.ops.orders.operator import RunningLaunch, read_statuses
+from swarmctl.ops.orders.operator import read_statuses
 from swarmctl.ops.orders.order_delivery import Reply, deliver
+from swarmctl.ops.running_launches import RunningLaunch
 
 _LEAD_S = 1.5  # from the order to the begin of the mission, the same for all
 _NUMBER_BYTES = 6  # of a digest: a number that a floating-point argument holds exactly

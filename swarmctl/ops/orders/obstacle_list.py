@@ -29,9 +29,10 @@ from swarmctl.configuration.source import read_tree
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.ops.config_help import write_new
-from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, RunningLaunch, joined, vector
+from swarmctl.files import write_new
+from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, joined, vector
 from swarmctl.ops.orders.order_delivery import no_operator
+from swarmctl.ops.running_launches import RunningLaunch
 
 _OPTIONS = {  # of the command line, by key
     "center_ned_m": "--center",

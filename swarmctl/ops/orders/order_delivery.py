@@ -20,7 +20,8 @@ from swarmctl.core.operator_verbs import OPERATOR_VERBS, PEER, Answer, Order
 from swarmctl.core.text import printable
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, RunningLaunch, joined, refuse_ending
+from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, joined
+from swarmctl.ops.running_launches import RunningLaunch, refuse_ending
 
 _POLL_S = 0.02
 _MOST_MESSAGES = 32  # of one repetition, so that they fit into an agent's ring

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_START, StartError
-from swarmctl.ops.flight.processes import Child
+from swarmctl.ops.processes import Child
 from swarmctl.ops.supervision.status_table import AgentView, name_of
 
 RECOVERY_S = 90.0  # a failsafe that returns home first needs most of it

@@ -18,11 +18,11 @@ from swarmctl.config import Config
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
-from swarmctl.ops.flight.launch_result import LaunchResult, why_it_failed
-from swarmctl.ops.flight.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.orders.order_delivery import numbered
+from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.hearing import Hearing
+from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from swarmctl.ops.flight.processes import Child
+from swarmctl.ops.processes import Child
 
 _ADDRESS, _PAGE = "viewer rerun+", "page http://"  # how the lines begin in which it says where
 

@@ -26,8 +26,8 @@ from swarmctl.errors import StartError
 from swarmctl.mavlink.signing.channel import CHECK_LINK, SigningChannel
 from swarmctl.mavlink.signing.recognition import SignedRecognition
 from swarmctl.mavlink.signing.stamp_file import kept_channel
-from swarmctl.ops.flight.preflight import claim_ports
-from swarmctl.ops.flight.processes import Child, RunContext, end_all, run_name, sitl_command
+from swarmctl.ops.preflight import claim_ports
+from swarmctl.ops.processes import Child, RunContext, end_all, run_name, sitl_command
 from swarmctl.signing_keys import read_keys
 from swarmctl.wall_clock import WallClock, monotonic_us
 

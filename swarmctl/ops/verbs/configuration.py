@@ -48,10 +48,11 @@ def config_init(
     ] = None,
 ) -> int:
     """Write a commented configuration to begin with; of an example also the Python or CSV file that it flies."""
+    from swarmctl.files import write_new
     from swarmctl.ops import config_help
 
     texts = config_help.initial_files(name, output)
-    config_help.write_new(texts)
+    write_new(texts)
     for path in texts:
         print(path)
     return EXIT_OK

@@ -29,8 +29,8 @@ def mission_set(
 
     Exit code 0: every agent asked has accepted; 4: one has refused, or has not answered in time, and is named.
     """
-    from swarmctl.ops.orders import operator
+    from swarmctl.ops import running_launches
     from swarmctl.ops.orders.mission_file import set_mission
 
-    launch = operator.find_launch(run)
+    launch = running_launches.find_launch(run)
     return told(MISSION, launch.run, lambda: set_mission(launch, file, agent or []), as_json=as_json)

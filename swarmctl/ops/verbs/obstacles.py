@@ -27,9 +27,10 @@ File = Annotated[Path, typer.Argument(metavar="FILE", help="TOML file of [[obsta
 @obstacle_app.command("list")
 def obstacle_list(run: Run = None, as_json: AsJson = False) -> int:
     """List the obstacles that the agents know: number, place now, sizes, velocity."""
-    from swarmctl.ops.orders import obstacle_list, operator
+    from swarmctl.ops import running_launches
+    from swarmctl.ops.orders import obstacle_list
 
-    launch = operator.find_launch(run)
+    launch = running_launches.find_launch(run)
     return _show(launch.run, obstacle_list.read_obstacles(launch), as_json)
 
 
@@ -112,18 +113,20 @@ def obstacle_save(
     as_json: AsJson = False,
 ) -> int:
     """Write the obstacles of a running launch, as they are now, to a file that `load` and configurations take."""
-    from swarmctl.ops.orders import obstacle_list, operator
+    from swarmctl.ops import running_launches
+    from swarmctl.ops.orders import obstacle_list
 
-    known = obstacle_list.read_obstacles(operator.find_launch(run))
+    known = obstacle_list.read_obstacles(running_launches.find_launch(run))
     obstacle_list.write_file(file, known)
     print(obstacle_list.as_json(known) if as_json else f"{len(known.obstacles)} obstacles: {file}")
     return EXIT_OK
 
 
 def _change(run: str | None, as_json: bool, change: Callable[[ObstaclesMessage], Sequence[ListedObstacle]]) -> int:
-    from swarmctl.ops.orders import obstacle_list, operator
+    from swarmctl.ops import running_launches
+    from swarmctl.ops.orders import obstacle_list
 
-    launch = operator.find_launch(run)
+    launch = running_launches.find_launch(run)
     return _show(launch.run, obstacle_list.change_obstacles(launch, change), as_json)
 
 

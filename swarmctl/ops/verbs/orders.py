@@ -70,10 +70,10 @@ def _argument_of(verb: str, name: str) -> VerbArgument:
 
 
 def _give(order: Order, run: str | None, agents: list[int], as_json: bool) -> int:
-    from swarmctl.ops.orders import operator
+    from swarmctl.ops import running_launches
     from swarmctl.ops.orders.order_delivery import deliver
 
-    launch = operator.find_launch(run)
+    launch = running_launches.find_launch(run)
     return told(order.verb, launch.run, lambda: deliver(launch, order, agents), as_json=as_json)
 
 

@@ -19,7 +19,7 @@ import swarmctl
 from swarmctl.api.flight_process import FlightProcess
 from swarmctl.config import Config
 from swarmctl.core.types import Phase
-from swarmctl.ops.orders.operator import LAUNCH_FILE, RunningLaunch
+from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
 from tests.unit.ops.test_cli import HEAVY
 from tests.unit.telemetry.test_hostile_run_folder import REFUSED
 from tests.unit.telemetry.test_run_folder import write_finished_run

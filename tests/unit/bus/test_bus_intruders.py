@@ -21,7 +21,7 @@ import pytest
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
-from swarmctl.bus.messages.commitment_messages import PeerTrajectories, encode_trajectory_message
+from swarmctl.bus.messages.commitment_messages import encode_trajectory_message
 from swarmctl.bus.messages.json_messages import CommandMessage, encode_message, first_list
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.bus.network.identities import add_identity, make_identities, revoke_identity
@@ -29,6 +29,7 @@ from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US, SealedBus
 from swarmctl.bus.network.seals import TAG_BYTES, PairKeys, Sealer, SealVerifier, overhead_bytes
+from swarmctl.bus.peer_trajectories import PeerTrajectories
 from swarmctl.bus.relay import RelayingBus, encode_relay
 from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, PATH, RELAY, STATUS, TRAJECTORY, Topic
 from swarmctl.control.collision.separation import SeparationParams

@@ -19,12 +19,12 @@ from swarmctl.config import Config, dump, load
 from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError, SwarmError
-from swarmctl.ops.flight import preflight
-from swarmctl.ops.flight.launch_result import why_it_failed
-from swarmctl.ops.flight.processes import RunContext, agent_commands, sitl_command, viewer_command
+from swarmctl.ops import preflight, running_launches
 from swarmctl.ops.flight.summary import summary_lines, violation_lines
 from swarmctl.ops.orders import operator
 from swarmctl.ops.orders.fault import inject, parse_fault
+from swarmctl.ops.processes import RunContext, agent_commands, sitl_command, viewer_command
+from swarmctl.ops.supervision.launch_result import why_it_failed
 from swarmctl.ops.supervision.status_table import (
     AgentView,
     LiveTable,
@@ -251,7 +251,7 @@ def test_a_fault_without_a_simulator_says_which_kind_of_without(
     tmp_path: Path, settings: tuple[str, ...], error: type[SwarmError], words: str
 ) -> None:
     (tmp_path / "config.toml").write_text(dump(load(None, ["swarm.agents=1", *settings])))
-    launch = operator.RunningLaunch("run", f"{SCHEME}{tmp_path}/bus.sock", 1, 0.0, 1, str(tmp_path))
+    launch = running_launches.RunningLaunch("run", f"{SCHEME}{tmp_path}/bus.sock", 1, 0.0, 1, str(tmp_path))
     with pytest.raises(error, match=words):
         inject(launch, parse_fault({"kind": "gps_loss"}, 1))
 

@@ -22,9 +22,10 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import MISSION, OPERATOR_VERBS, Answer, OperatorVerb, Order, VerbArgument
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, MissionError, StartError, exit_code_of
-from swarmctl.ops import cli
-from swarmctl.ops.orders import obstacle_list, operator
+from swarmctl.ops import cli, running_launches
+from swarmctl.ops.orders import obstacle_list
 from swarmctl.ops.orders.order_delivery import Reply
+from swarmctl.ops.running_launches import RunningLaunch
 from swarmctl.ops.verbs import orders
 
 Run = Callable[..., int]
@@ -244,7 +245,7 @@ def test_expected_errors_are_words_and_their_exit_code(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(operator, "find_launch", fail)
+    monkeypatch.setattr(running_launches, "find_launch", fail)
     assert run("status") == code
     captured = capsys.readouterr()
     assert captured.err == f"{error}\n"
@@ -276,7 +277,7 @@ def test_unexpected_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch)
     def fail(*_: object) -> None:
         raise ZeroDivisionError("bug")
 
-    monkeypatch.setattr(operator, "find_launch", fail)
+    monkeypatch.setattr(running_launches, "find_launch", fail)
     monkeypatch.setattr(sys, "argv", ["swarmctl", "status"])
     with pytest.raises(ZeroDivisionError, match="bug"):
         cli.main()
@@ -345,17 +346,17 @@ def test_the_registry_knows_live_launches_and_forgets_dead_ones(
     folder.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", "")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    started_s, pid = operator.process_start_s()
-    launch = operator.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
-    operator.announce(launch)
+    started_s, pid = running_launches.process_start_s()
+    launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    running_launches.announce(launch)
     assert registry.stat().st_mode & 0o777 == 0o700
-    assert operator.find_launch(None) == launch
-    assert operator.find_launch(str(folder)) == launch
-    operator.announce(operator.RunningLaunch("reused pid", "unixsock-stream//x", pid, started_s - 60, 3, str(folder)))
+    assert running_launches.find_launch(None) == launch
+    assert running_launches.find_launch(str(folder)) == launch
+    running_launches.announce(RunningLaunch("reused pid", "unixsock-stream//x", pid, started_s - 60, 3, str(folder)))
     with pytest.raises(StartError):
-        operator.find_launch(str(folder))
+        running_launches.find_launch(str(folder))
     with pytest.raises(StartError):
-        operator.find_launch(None)
+        running_launches.find_launch(None)
     assert list(registry.iterdir()) == []
 
 
@@ -364,23 +365,23 @@ def test_a_note_that_cannot_be_written_stops_neither_the_flight_nor_the_others(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", "")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    started_s, pid = operator.process_start_s()
-    launch = operator.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(tmp_path / "gone"))
-    operator.announce(launch)
-    assert operator.find_launch(None) == launch
+    started_s, pid = running_launches.process_start_s()
+    launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(tmp_path / "gone"))
+    running_launches.announce(launch)
+    assert running_launches.find_launch(None) == launch
 
 
 @pytest.mark.timeout(20)
 def test_a_note_in_a_received_folder_that_is_none_is_no_launch(tmp_path: Path) -> None:
-    note = tmp_path / operator.LAUNCH_FILE
+    note = tmp_path / running_launches.LAUNCH_FILE
     for content in (b"{", b"[]", b'{"run": 1}', b"\xff\xfe", b"[" * 100_000):
         note.write_bytes(content)
         with pytest.raises(StartError, match="no launch runs there"):
-            operator.find_launch(str(tmp_path))
+            running_launches.find_launch(str(tmp_path))
     note.unlink()
     os.mkfifo(note)
     with pytest.raises(StartError, match="no launch runs there"):
-        operator.find_launch(str(tmp_path))
+        running_launches.find_launch(str(tmp_path))
 
 
 def squat_open(place: Path) -> None:
@@ -416,20 +417,20 @@ def test_a_launch_and_its_verbs_find_each_other_although_another_user_takes_the_
     if squat is squat_of_another and os.getuid() != 0:
         pytest.skip("only root can give a directory away")
     squat(temporary / f"swarmctl-{os.getuid()}")
-    started_s, pid = operator.process_start_s()
-    launch = operator.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
-    forged = operator.RunningLaunch("forged", "unixsock-stream//evil", pid, started_s + 0.5, 3, str(folder))
+    started_s, pid = running_launches.process_start_s()
+    launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    forged = RunningLaunch("forged", "unixsock-stream//evil", pid, started_s + 0.5, 3, str(folder))
     if squat is not squat_file:
         (temporary / f"swarmctl-{os.getuid()}" / "1.json").write_bytes(msgspec.json.encode(forged))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime) if at_launch else "")
-    operator.announce(launch)
-    operator.announce(launch)
+    running_launches.announce(launch)
+    running_launches.announce(launch)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime) if at_verb else "")
-    assert operator.find_launch(None) == launch
-    operator.withdraw()
+    assert running_launches.find_launch(None) == launch
+    running_launches.withdraw()
     if at_launch == at_verb:
         with pytest.raises(StartError):
-            operator.find_launch(None)
+            running_launches.find_launch(None)
     assert len(list(temporary.glob("swarmctl-*"))) == 2, "one more, not one each time"
 
 
@@ -441,11 +442,11 @@ def test_a_runtime_directory_of_another_user_is_not_used(monkeypatch: pytest.Mon
     runtime.chmod(0o755)
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
-    started_s, pid = operator.process_start_s()
-    launch = operator.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
-    operator.announce(launch)
+    started_s, pid = running_launches.process_start_s()
+    launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    running_launches.announce(launch)
     assert list(runtime.iterdir()) == []
-    assert operator.find_launch(None) == launch
+    assert running_launches.find_launch(None) == launch
 
 
 def test_with_several_launches_one_is_chosen_by_name_or_folder(
@@ -453,16 +454,16 @@ def test_with_several_launches_one_is_chosen_by_name_or_folder(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", "")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    started_s, pid = operator.process_start_s()
-    circle = operator.RunningLaunch("circle-1a", "unixsock-stream//x", pid, started_s, 3, str(tmp_path / "first"))
-    swap = operator.RunningLaunch("swap-2b", "unixsock-stream//y", os.getppid(), started_s, 6, str(tmp_path / "second"))
+    started_s, pid = running_launches.process_start_s()
+    circle = RunningLaunch("circle-1a", "unixsock-stream//x", pid, started_s, 3, str(tmp_path / "first"))
+    swap = RunningLaunch("swap-2b", "unixsock-stream//y", os.getppid(), started_s, 6, str(tmp_path / "second"))
     (tmp_path / "second").mkdir()
-    monkeypatch.setattr(operator, "_runs", lambda launch: launch.run != "dead")
+    monkeypatch.setattr(running_launches, "runs", lambda launch: launch.run != "dead")
     for launch in (circle, swap):
-        operator.announce(launch)
-    assert operator.find_launch("circle") == circle
-    assert operator.find_launch("swap-2b") == swap
-    assert operator.find_launch(str(tmp_path / "second")) == swap
+        running_launches.announce(launch)
+    assert running_launches.find_launch("circle") == circle
+    assert running_launches.find_launch("swap-2b") == swap
+    assert running_launches.find_launch(str(tmp_path / "second")) == swap
     for arguments in (("hold",), ("status",), ("fault", "gust"), ("exclude", "--peer", "1"), ("obstacle", "list")):
         assert run(*arguments) == 2, arguments
         said = capsys.readouterr().err
@@ -470,4 +471,4 @@ def test_with_several_launches_one_is_chosen_by_name_or_folder(
         assert "circle-1a  3 agents" in said
         assert "swap-2b  6 agents" in said
     with pytest.raises(StartError, match=r"running: .*circle-1a"):
-        operator.find_launch("line")
+        running_launches.find_launch("line")

@@ -17,6 +17,7 @@ import pytest
 from swarmctl.config import Config, load, load_mission
 from swarmctl.configuration.problems import all_keys
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.files import write_new
 from swarmctl.ops import config_help
 
 ROOT = Path(__file__).parents[3]
@@ -117,14 +118,14 @@ def test_the_file_of_all_keys_sets_nothing_and_states_every_default(tmp_path: Pa
 
 def test_a_built_in_file_is_written_with_its_comments_and_overwrites_nothing(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    config_help.write_new(config_help.initial_files("x500_circle", path))
+    write_new(config_help.initial_files("x500_circle", path))
     assert load(path) == load(ROOT / "configs" / "x500_circle.toml")
     assert "#" in path.read_text()
     with pytest.raises(ConfigError, match="exists already"):
-        config_help.write_new({tmp_path / "other.toml": "", path: ""})
+        write_new({tmp_path / "other.toml": "", path: ""})
     assert not (tmp_path / "other.toml").exists(), "all or none"
     with pytest.raises(StartError, match="can't be written"):
-        config_help.write_new({tmp_path / "no" / "where.toml": ""})
+        write_new({tmp_path / "no" / "where.toml": ""})
     with pytest.raises(ConfigError, match=r"known are .*figure_8, .*own_pid, .*x500_circle"):
         config_help.initial_files("x501")
 
@@ -135,7 +136,7 @@ def test_an_example_comes_with_what_it_flies_and_is_checked_where_it_was_written
 ) -> None:
     monkeypatch.chdir(tmp_path)
     texts = config_help.initial_files(name)
-    config_help.write_new(texts)
+    write_new(texts)
     beside = {path.name for path in (ROOT / "configs" / "examples").glob(f"{name}.*")}
     assert {path.name for path in tmp_path.iterdir()} == beside
     assert f"configs/examples/{name}" not in "".join(texts.values()), "what it says is to be typed is about the copy"
@@ -151,7 +152,7 @@ def test_an_example_comes_with_what_it_flies_and_is_checked_where_it_was_written
 
 
 def test_the_files_of_an_example_go_where_the_first_goes(tmp_path: Path) -> None:
-    config_help.write_new(config_help.initial_files("own_pid", tmp_path / "mine.toml"))
+    write_new(config_help.initial_files("own_pid", tmp_path / "mine.toml"))
     assert {path.name for path in tmp_path.iterdir()} == {"mine.toml", "own_pid.py"}
     assert load(tmp_path / "mine.toml").controller.kind == "own_pid:Pid"
     assert list(config_help.initial_files("steer_swarm")) == [Path("steer_swarm.py")]

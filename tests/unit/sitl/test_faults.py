@@ -21,7 +21,7 @@ from swarmctl.errors import ConfigError, StartError
 from swarmctl.mavlink.framing import message_id
 from swarmctl.mavlink.transport import Datagram
 from swarmctl.ops.orders.fault import as_json, inject, line_of, parse_fault
-from swarmctl.ops.orders.operator import RunningLaunch
+from swarmctl.ops.running_launches import RunningLaunch
 from swarmctl.process_lifetime import remove_socket
 from swarmctl.simulator_config import FAULTS, FaultParams
 from tests.benches.flown_world import FlownWorld

@@ -14,7 +14,7 @@ from sitl.plant.attitude import THESIS_GAINS
 from sitl.plant.estimator import ESTIMATORS
 from swarmctl.config import Config, dump, load
 from swarmctl.errors import ConfigError
-from swarmctl.ops.flight.processes import RunContext, sitl_command
+from swarmctl.ops.processes import RunContext, sitl_command
 from swarmctl.simulator_config import SimulatorConfig, SimulatorParams
 
 OUTFIT = (

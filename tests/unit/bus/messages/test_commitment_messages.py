@@ -12,15 +12,14 @@ import pytest
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.messages.commitment_messages import (
-    MAX_CLOCK_ERROR_US,
     MAX_PEERS,
     MAX_POINTS,
     MAX_STEP_US,
-    PeerTrajectories,
     decode_trajectory_message,
     encode_trajectory_message,
 )
 from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.peer_trajectories import MAX_CLOCK_ERROR_US, PeerTrajectories
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Presence
 from swarmctl.control.commit.protocol import acknowledgements

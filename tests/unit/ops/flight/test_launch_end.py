@@ -17,14 +17,16 @@ from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config
 from swarmctl.core.operator_verbs import Order
 from swarmctl.errors import StartError
+from swarmctl.ops import running_launches
 from swarmctl.ops.flight import launch as launching
 from swarmctl.ops.flight.launch import Launcher, LaunchOptions, SwarmPart, judged
-from swarmctl.ops.flight.launch_result import LaunchResult
-from swarmctl.ops.flight.preflight import ReservedPorts
 from swarmctl.ops.orders import obstacle_list, operator, order_delivery
 from swarmctl.ops.orders.obstacle_list import read_obstacles
-from swarmctl.ops.orders.operator import RunningLaunch, announce, find_launch, joined, read_statuses
+from swarmctl.ops.orders.operator import joined, read_statuses
 from swarmctl.ops.orders.order_delivery import deliver
+from swarmctl.ops.preflight import ReservedPorts
+from swarmctl.ops.running_launches import RunningLaunch, announce, find_launch
+from swarmctl.ops.supervision.launch_result import LaunchResult
 
 ENDING = r"circle.* is ending: nobody answers any more, it writes its report to .*run"
 
@@ -34,7 +36,7 @@ def launch(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> RunningLaunch:
     """Return a launch of this process, which flies."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", "")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    started_s, pid = operator.process_start_s()
+    started_s, pid = running_launches.process_start_s()
     (tmp_path / "run").mkdir()
     flies = RunningLaunch("circle-1a", f"{SCHEME}{tmp_path}/bus.sock", pid, started_s, 3, str(tmp_path / "run"))
     announce(flies)
@@ -64,7 +66,7 @@ def test_a_launch_that_is_ending_is_not_in_the_way_of_one_that_flies(
     launch: RunningLaunch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = msgspec.structs.replace(launch, run="circle-2b", pid=os.getppid(), run_dir=f"{launch.run_dir}/other")
-    monkeypatch.setattr(operator, "_runs", lambda launch: True)
+    monkeypatch.setattr(running_launches, "runs", lambda launch: True)
     announce(other)
     end(launch)
     assert find_launch(None) == other

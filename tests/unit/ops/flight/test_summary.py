@@ -17,7 +17,7 @@ _SUM_UP = """
 import resource, sys
 from pathlib import Path
 from swarmctl.config import Config
-from swarmctl.ops.flight.launch_result import LaunchResult
+from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.ops.flight.summary import sum_up
 directory, limit = Path(sys.argv[1]), int(sys.argv[2])
 if limit >= 0:

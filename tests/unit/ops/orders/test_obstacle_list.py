@@ -23,7 +23,7 @@ from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.orders import obstacle_list
-from swarmctl.ops.orders.operator import RunningLaunch
+from swarmctl.ops.running_launches import RunningLaunch
 from tests.benches.swarm_of_hosts import SwarmOfHosts
 
 UTC_US = 1_700_000_000_000_000

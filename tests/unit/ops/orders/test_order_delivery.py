@@ -16,8 +16,8 @@ from swarmctl.bus.topics import ANSWER, COMMAND, OPERATOR, STATUS
 from swarmctl.core.operator_verbs import PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.ops.orders.operator import RunningLaunch
 from swarmctl.ops.orders.order_delivery import OrderDelivery, Reply, addressed
+from swarmctl.ops.running_launches import RunningLaunch
 from tests import builders
 from tests.benches.swarm_of_hosts import SwarmOfHosts
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from swarmctl.ops.flight.processes import Child
+from swarmctl.ops.processes import Child
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
 
 LIVE, PAGE = "rerun+http://127.0.0.1:9876/proxy", "http://127.0.0.1:9090?url=rerun"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from swarmctl.config import load
-from swarmctl.ops.flight.processes import Child, Command, wants_realtime
+from swarmctl.ops.processes import Child, Command, wants_realtime
 
 
 @pytest.mark.parametrize(
