@@ -1,6 +1,6 @@
 """The topics of the bus: one table. A bus delivers no message that is too long for its topic.
 
-Their messages are laid out in `path_messages.py`, `commitment_messages.py`, `relay.py` and `json_messages.py`; ticks
+Their messages are laid out in `bus/messages/` and `relay.py`; ticks
 are rows of `core.recorded.records`.
 """
 

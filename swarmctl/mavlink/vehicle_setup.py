@@ -37,6 +37,7 @@ class VehicleSetup:
     Attributes:
         ready: everything has been requested and answered since the last reboot.
         restored: every changed parameter has been set back, or could not be.
+        restore_from_us: when the first of them is set back, once that has begun.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class VehicleSetup:
         self._compared = False  # read values have been compared with wanted ones
         self._before: dict[str, Command] = {}  # parameter -> command that restores its original value
         self._restoring = False
-        self._restore_from_us = 0
+        self.restore_from_us = 0
         self._open: Command | None = None
         self._failed: dict[str, str] = {}  # parameter -> answer of the autopilot
         self._origin_us = 0
@@ -86,10 +87,13 @@ class VehicleSetup:
         return {name: set_back.value or float(set_back.number) for name, set_back in self._before.items()}
 
     def restore(self, now_us: int) -> None:
-        """Begin to restore every changed parameter; the vehicle has just been heard disarmed, or is handed back."""
+        """Begin to restore every changed parameter; the vehicle has just been heard disarmed, or is handed back.
+
+        None is set within the time in which its dialect may be saving its own: a PX4 can stop of it.
+        """
         self._todo = deque(reversed(self._before.values()))
         self._restoring = True
-        self._restore_from_us = now_us + (round(1e6 * self._dialect.saving_s) if self._dialect else 0)
+        self.restore_from_us = now_us + (round(1e6 * self._dialect.restore_after_s) if self._dialect else 0)
 
     def on_result(self, result: CommandResult) -> None:
         """Take a result of the command port, whichever part requested it."""
@@ -110,7 +114,7 @@ class VehicleSetup:
         self._open = None
         if self._restoring:
             self.restored = not self._todo
-            if now_us < self._restore_from_us:
+            if now_us < self.restore_from_us:
                 return
         elif self.ready:
             self._watch(now_us)

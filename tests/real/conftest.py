@@ -78,8 +78,9 @@ def field(network: Network, tmp_path: Path, tmp_path_factory: pytest.TempPathFac
         on_truth: Callable[[Witness, int, Truth], None] | None = None,
         is_alone: bool = False,
     ) -> Field:
-        require(kind, network, count)
+        require(kind, network, 0)  # before a wait of minutes
         turns.enter_context(turn(tmp_path_factory.getbasetemp().parent, is_alone))
+        require(kind, network, count)
         fleet = Fleet(kind, count, network, tmp_path / "vehicles", parameters)
         fields.append(Field(fleet, Witness(fleet, on_truth), tmp_path))
         return fields[-1]
@@ -94,16 +95,17 @@ def field(network: Network, tmp_path: Path, tmp_path_factory: pytest.TempPathFac
 def turn(shared: Path, is_alone: bool) -> Iterator[None]:
     """Wait until fewer flights are in the air than this machine has processors: lanes share that folder.
 
-    One that has to be accurate or complete waits until there is no other: two of them, each with its agents, take turns
-    of the processors, and what is measured then is how late their ticks are.
+    A flight whose accuracy or violations are judged waits until there is no other: two of them, each with its agents,
+    take turns of the processors, and what is measured then is how late their ticks are. Nobody passes who waits.
     """
     with contextlib.ExitStack() as stack:
         names = [shared / f"flight-{i}.lock" for i in range(len(os.sched_getaffinity(0)))]
         files = [stack.enter_context(name.open("w")) for name in names]
         wanted = [[file] for file in files] if is_alone else [files]  # each of them, or any one
-        for choice in wanted:
-            while not any(locked(file) for file in choice):
-                time.sleep(LOOK_S)
+        with (shared / "next-flight.lock").open("w") as gate:
+            for choice in ([gate], *wanted):
+                while not any(locked(file) for file in choice):
+                    time.sleep(LOOK_S)
         yield
 
 

@@ -16,7 +16,7 @@ from tests.process.test_readme import ROOT
 from tests.real.autopilots import PX4
 from tests.real.conftest import Field, Fielder
 
-pytestmark = [pytest.mark.process, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 
 READY_S = 60.0
 CONFIG = """[swarm]

@@ -181,7 +181,7 @@ def run(options: argparse.Namespace) -> int:
     if options.scale:
         written = _run_scale(options, solvers[0], console)
     else:
-        rows = bench(options.neighbours, solvers, options.ticks, options.slsqp, console=console)
+        rows = bench(options.neighbours, solvers, options.ticks, options.slsqp is not False, console=console)
         show(rows, console)
         written = [write(rows, options.out)]
     if note:

@@ -17,14 +17,17 @@ NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
 MAX_NEIGHBOURS = 99
 AGENTS = (3, 6, 12, 24)
 MAX_AGENTS = 100
-SOLVERS = ("osqp", "daqp")  # those of `control.mpc.qp`, which takes a second to import
+SOLVERS = ("osqp", "daqp")  # those of `control.mpc.solvers.qp`, which takes a second to import
 _WHAT = """The `bench` verb: measures the duration of an agent's tick, split into parts, for growing swarms and each
 QP solver; with --scale, how costs grow with neighbours and agents, with fitted exponents and a plot."""
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the verb and return the process exit code."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if problem := _problem(options):
+        parser.error(problem)
     from sitl.studies.bench.bench import run
 
     return exit_code_of(partial(run, options))
@@ -35,13 +38,21 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder to write to; default: here")
     parser.add_argument("--neighbours", metavar="K,K", type=_counts, default=list(NEIGHBOURS), help="counts, 0 to 99")
     parser.add_argument("--scale", action="store_true", help="how costs grow, with one solver: scale.json, scale.html")
-    parser.add_argument(
-        "--agents", metavar="N,N", type=_agents, default=list(AGENTS), help="counts of --scale, 2 to 100"
-    )
+    parser.add_argument("--agents", metavar="N,N", type=_agents, help="counts of --scale, 2 to 100")
     parser.add_argument("--solver", action="append", choices=SOLVERS, help="repeatable; default: all installed")
     parser.add_argument("--ticks", metavar="N", type=_ticks, default=300, help="measured: ticks, and x-y problems")
-    parser.add_argument("--slsqp", action=argparse.BooleanOptionalAction, default=True, help="the nonlinear baseline")
+    parser.add_argument("--slsqp", action=argparse.BooleanOptionalAction, help="the nonlinear baseline; default: yes")
     return parser
+
+
+def _problem(options: argparse.Namespace) -> str:
+    """Return which options don't go together, or ""; set what `--scale` measures by default."""
+    if not options.scale:
+        return "--agents needs --scale" if options.agents else ""
+    if options.slsqp is not None or len(options.solver or ()) > 1:
+        return "--scale measures one solver, and not SLSQP"
+    options.agents = options.agents or list(AGENTS)
+    return ""
 
 
 def _counts(text: str) -> list[int]:
@@ -59,7 +70,7 @@ def _numbers(text: str, least: int, most: int) -> list[int]:
         counts = [-1]
     if not all(least <= count <= most for count in counts):
         raise argparse.ArgumentTypeError(f"{text!r}: give numbers from {least} to {most}, such as {least},8")
-    return list(dict.fromkeys(counts))
+    return sorted(set(counts))
 
 
 def _ticks(text: str) -> int:

@@ -3,9 +3,9 @@
 Two questions, each with counts of its own:
 
 - neighbours: the tick of one agent that has a row in its problem for each of them, as in `bench`;
-- agents: a whole swarm in lockstep, hovering 3 m apart, where each agent has rows for its nearest only
+- agents: a whole swarm in lockstep, hovering 3 m apart, where each agent has rows for its two nearest
   (`separation.max_neighbours`) but hears everybody. Processor time counts all of it, the simulator included; bytes are
-  what an agent gives to its bus.
+  what an agent gives to its bus. Swarms are measured for at least 2 s, a whole number of periods of their status.
 
 An exponent is that of cost = a * count ** exponent, by least squares in logarithms: 0 is flat, 1 is linear.
 """
@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -38,8 +38,10 @@ from swarmctl.telemetry.report.pages import render
 _SPACING_M = 3.0
 _HEIGHT_M = 3.0
 _ENDLESS_S = 3600.0
+_ROWS = 2  # neighbours with rows in a swarm: as many at every count, from 3 agents on
 _SETTLE_STEPS = 50  # after the last agent has begun to track
-_SMALLEST = 2  # counts of an exponent: 0 has no logarithm, and 1 says nothing yet
+_LEAST_S, _STATUS_S = 2.0, 0.2
+_SMALLEST = 2  # count that an exponent begins at: 0 has no logarithm, and 1 agent has nobody to share with
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +53,7 @@ class ScaleRow:
     count: int
     tick_p50_ms: float  # of one agent
     tick_p99_ms: float
-    agent_s_per_core_s: float | None = None  # flown seconds of agents in one second of a processor
+    real_time_per_core: float | None = None  # flown seconds of agents, added up, in one second of a processor
     bytes_per_agent_s: float | None = None  # published on the bus
 
 
@@ -60,6 +62,7 @@ class Growth:
     """A cost over a count, and what was fitted to it."""
 
     title: str
+    over: str  # what is counted
     counts: Array  # (K,)
     costs: Array  # (K,)
     exponent: float  # NaN with fewer than two counts
@@ -68,8 +71,11 @@ class Growth:
     def words(self) -> str:
         """The growth in words."""
         if math.isnan(self.exponent):
-            return self.title
-        return f"{self.title}: exponent {self.exponent:.2f}, twice as many cost {2.0**self.exponent:.2f} times as much"
+            return f"{self.title} over {self.over}"
+        twice = 2.0**self.exponent
+        return (
+            f"{self.title} over {self.over}: exponent {self.exponent:.2f}, twice as many cost {twice:.2f} times as much"
+        )
 
 
 def neighbour_rows(counts: Sequence[int], solver: str, ticks: int, on_count: Callable[[], None]) -> list[ScaleRow]:
@@ -94,10 +100,12 @@ def agent_rows(counts: Sequence[int], solver: str, ticks: int, on_count: Callabl
 def _swarm_row(count: int, solver: str, ticks: int) -> ScaleRow:
     config = _hovering(count, solver)
     flight = Lockstep(config)
-    get_under_way(solver, flight.step, lambda: all(tracks(flight, agent) for agent in range(count)))
+    get_under_way(f"{count} agents with {solver}", flight.step, lambda: all(tracks(flight, k) for k in range(count)))
     for _ in range(_SETTLE_STEPS):
         flight.step()
-    sent_before, steps, tick_ms = _sent_bytes(flight), math.ceil(ticks / count), list[float]()
+    period = round(_STATUS_S * config.agent.rate_hz)
+    steps = period * math.ceil(max(ticks / count, _LEAST_S * config.agent.rate_hz) / period)
+    sent_before, tick_ms = _sent_bytes(flight), list[float]()
     with settled_garbage():
         began_s = time.process_time()
         for _ in range(steps):
@@ -106,7 +114,7 @@ def _swarm_row(count: int, solver: str, ticks: int) -> ScaleRow:
         spent_s = time.process_time() - began_s
     flown_s = steps * count / config.agent.rate_hz
     bytes_s = (_sent_bytes(flight) - sent_before) / flown_s
-    return _row("agents", solver, count, np.array(tick_ms), agent_s_per_core_s=flown_s / spent_s, bytes_s=bytes_s)
+    return _row("agents", solver, count, np.array(tick_ms), real_time_per_core=flown_s / spent_s, bytes_s=bytes_s)
 
 
 def _row(
@@ -115,7 +123,7 @@ def _row(
     count: int,
     tick_ms: Array,
     *,
-    agent_s_per_core_s: float | None = None,
+    real_time_per_core: float | None = None,
     bytes_s: float | None = None,
 ) -> ScaleRow:
     return ScaleRow(
@@ -124,7 +132,7 @@ def _row(
         count=count,
         tick_p50_ms=round(float(np.percentile(tick_ms, 50)), 4),
         tick_p99_ms=round(float(np.percentile(tick_ms, 99)), 4),
-        agent_s_per_core_s=None if agent_s_per_core_s is None else round(agent_s_per_core_s, 3),
+        real_time_per_core=None if real_time_per_core is None else round(real_time_per_core, 3),
         bytes_per_agent_s=None if bytes_s is None else round(bytes_s, 1),
     )
 
@@ -139,6 +147,7 @@ def _hovering(count: int, solver: str) -> Config:
             f"swarm.agents={count}",
             f"start.positions_ned_m={places}",
             "mission.kind=hover",
+            f"separation.max_neighbours={_ROWS}",
             f"mission.duration_s={_ENDLESS_S}",
             f"controller.mpc.qp.solver='{solver}'",
             "sitl.start='air'",
@@ -154,26 +163,20 @@ def growths(rows: Sequence[ScaleRow]) -> list[Growth]:
     """Return every cost over its count, with its exponent."""
     near = [row for row in rows if row.question == "neighbours"]
     swarm = [row for row in rows if row.question == "agents"]
+    spent = {row.count: 1.0 / row.real_time_per_core for row in swarm if row.real_time_per_core}
+    sent = {row.count: row.bytes_per_agent_s for row in swarm if row.bytes_per_agent_s}
     found = [
-        _growth("tick over neighbours [ms]", near, [row.tick_p50_ms for row in near]),
-        _growth("tick over agents [ms]", swarm, [row.tick_p50_ms for row in swarm]),
-        _growth(
-            "processor time for a second of one agent, over agents [s]",
-            swarm,
-            [1.0 / row.agent_s_per_core_s for row in swarm if row.agent_s_per_core_s],
-        ),
-        _growth(
-            "bytes published by one agent, over agents [1/s]",
-            swarm,
-            [row.bytes_per_agent_s for row in swarm if row.bytes_per_agent_s is not None],
-        ),
+        _growth("tick [ms]", "neighbours", {row.count: row.tick_p50_ms for row in near}),
+        _growth("tick [ms]", "agents", {row.count: row.tick_p50_ms for row in swarm}),
+        _growth("processor time for a second of one agent [s]", "agents", spent),
+        _growth("bytes published by one agent [1/s]", "agents", sent),
     ]
     return [growth for growth in found if len(growth.counts)]
 
 
-def _growth(title: str, rows: Sequence[ScaleRow], costs: Sequence[float]) -> Growth:
-    counts = np.array([row.count for row in rows], np.float64)
-    return Growth(title=title, counts=counts, costs=np.array(costs), exponent=exponent_of(counts, np.array(costs)))
+def _growth(title: str, over: str, costs: Mapping[int, float]) -> Growth:
+    counts, values = np.array(list(costs), np.float64), np.array(list(costs.values()))
+    return Growth(title=title, over=over, counts=counts, costs=values, exponent=exponent_of(counts, values))
 
 
 def exponent_of(counts: Array, costs: Array) -> float:
@@ -192,11 +195,11 @@ def write(rows: Sequence[ScaleRow], directory: Path) -> list[Path]:
         ConfigError: it can't be written.
     """
     written = [directory / "scale.json", directory / "scale.html"]
-    charts = [_chart(growth) for growth in growths(rows)]
+    page = render(__package__, "scale.html", rows=rows, charts=[_chart(growth) for growth in growths(rows)])
     try:
         directory.mkdir(parents=True, exist_ok=True)
         replace_text(written[0], json.dumps([asdict(row) for row in rows], indent=1) + "\n")
-        replace_text(written[1], render(__package__, "scale.html", rows=rows, charts=charts))
+        replace_text(written[1], page)
     except OSError as error:
         raise ConfigError("--out", [f"{directory}: can't be written: {error.strerror}"]) from error
     return written
@@ -210,17 +213,17 @@ def _chart(growth: Growth) -> Markup:
         scale = math.exp(float(np.mean(np.log(costs) - growth.exponent * np.log(counts))))
         lines.append(reference_line(counts, scale * counts**growth.exponent, label="fitted"))
     shown = (0.0, float(growth.counts.max()) * 1.02)
-    return time_chart(growth.words, lines, shown, from_zero=True, x_unit="")
+    return time_chart(growth.words, lines, shown, from_zero=True, x_unit=growth.over)
 
 
 def show(rows: Sequence[ScaleRow], console: Console) -> None:
     """Print the rows and what grows how."""
-    table = Table("count", "tick p50 (p99) [ms]", "agent-s per core-s", "bytes per agent [1/s]", box=SIMPLE)
+    table = Table("count", "tick p50 (p99) [ms]", "times real time per core", "bytes per agent [1/s]", box=SIMPLE)
     for row in rows:
         table.add_row(
             f"{row.count} {row.question}",
             f"{row.tick_p50_ms:.2f} ({row.tick_p99_ms:.2f})",
-            "" if row.agent_s_per_core_s is None else f"{row.agent_s_per_core_s:.1f}",
+            "" if row.real_time_per_core is None else f"{row.real_time_per_core:.1f}",
             "" if row.bytes_per_agent_s is None else f"{row.bytes_per_agent_s:.0f}",
         )
     console.print(table)

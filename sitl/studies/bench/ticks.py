@@ -45,7 +45,7 @@ def measure_ticks(
     """
     formations = {solver: Formation(formation_config(solver, neighbours, pillar)) for solver in solvers}
     for solver, formation in formations.items():
-        get_under_way(solver, formation.step, partial(_is_warm, formation))
+        get_under_way(f"an agent with {solver}", formation.step, partial(_is_warm, formation))
     timings: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
     with settled_garbage():
         for _ in range(ticks):
@@ -68,7 +68,7 @@ def measure_commitments(
     crowds = {solver: Lockstep(_swap_config(solver, neighbours + 1)) for solver in solvers}
     timings: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
     for solver, crowd in crowds.items():
-        get_under_way(solver, crowd.step, partial(tracks, crowd))
+        get_under_way(f"{neighbours + 1} agents with {solver}", crowd.step, partial(tracks, crowd))
     with settled_garbage():
         for _ in range(0, ticks, neighbours + 1):
             for solver, crowd in crowds.items():
@@ -102,7 +102,7 @@ def _is_warm(formation: Formation) -> bool:
     return formation.mission_t_s >= _WARM_UP_S
 
 
-def get_under_way(solver: str, step: Callable[[], None], ready: Callable[[], bool]) -> None:
+def get_under_way(who: str, step: Callable[[], None], ready: Callable[[], bool]) -> None:
     """Step until `ready`.
 
     Raises:
@@ -112,7 +112,7 @@ def get_under_way(solver: str, step: Callable[[], None], ready: Callable[[], boo
         step()
         if ready():
             return
-    raise MissionError(f"bench: the agent with {solver} did not begin within {_READY_WITHIN_TICKS} ticks")
+    raise MissionError(f"bench: {who} did not begin within {_READY_WITHIN_TICKS} ticks")
 
 
 def _parts(timing: TickTiming) -> tuple[float, ...]:

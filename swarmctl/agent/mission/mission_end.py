@@ -7,7 +7,7 @@ from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
-_RESTORE_TIMEOUT_US = 6_000_000  # longest wait for parameters to be restored before the process ends
+_RESTORE_TIMEOUT_US = 5_000_000  # longest wait for parameters to be restored, from when the first one is
 
 
 class MissionEnd:
@@ -23,21 +23,22 @@ class MissionEnd:
     def __init__(self, ports: Ports, mission: MissionState, vehicle_setup: VehicleSetup, alerts: Alerts) -> None:
         self._ports, self._mission, self._vehicle_setup = ports, mission, vehicle_setup
         self._alerts = alerts
-        self._ended_us: int | None = None
+        self._has_begun = False
 
     @property
     def done(self) -> bool:
         """Whether the mission has ended and the autopilot's parameters are restored, or the wait for it timed out."""
-        if self._ended_us is None:
+        if not self._has_begun:
             return False
-        return self._vehicle_setup.restored or self._ports.clock.now_us() - self._ended_us > _RESTORE_TIMEOUT_US
+        setup = self._vehicle_setup
+        return setup.restored or self._ports.clock.now_us() - setup.restore_from_us > _RESTORE_TIMEOUT_US
 
     def step(self, now_us: int) -> None:
         """Advance by one tick."""
         if not self._mission.finished:
             return
-        if self._ended_us is None:
-            self._ended_us = now_us
+        if not self._has_begun:
+            self._has_begun = True
             self._vehicle_setup.restore(now_us)
         left = self._vehicle_setup.left_changed
         if left and self.done and self._alerts.put("restore", f"parameters left changed, they were: {left}", now_us):

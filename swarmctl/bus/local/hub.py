@@ -1,4 +1,4 @@
-"""The bus of lockstep flights: in memory, on a simulated clock, with impairments that a seed repeats. Pure."""
+"""A bus in memory, of lockstep flights and of an agent without a router, with impairments that a seed repeats. Pure."""
 
 from __future__ import annotations
 

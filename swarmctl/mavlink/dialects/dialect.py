@@ -75,7 +75,7 @@ class Dialect:
     fence_checks: tuple[ParameterCheck, ...]  # what it thinks besides with a geofence; empty: none is uploaded to it
     log_suffix: str  # of the logs that it writes itself
     loss_parameter: str  # parameter of the setpoint timeout [s]
-    saving_s: float = 0.0  # for so long after a disarm it may be writing its parameters: none is set meanwhile
+    restore_after_s: float = 0.0  # from a disarm that is heard; until then it may be saving its parameters
     heeds_parameter: str = ""  # system id whose heartbeats its link-loss failsafe counts; "": any
 
     def mode(self, custom_mode: int) -> FlightMode:
