@@ -12,7 +12,7 @@ from swarmctl.agent.watches.alerts import Alerts
 from tests.unit.mavlink.test_vehicle_setup import ARDUCOPTER, PX4, Vehicle
 
 CHANGED: dict[int, tuple[dict[str, float], dict[str, float]]] = {  # each is asked for 3 s before it is given up
-    PX4: ({"NAV_DLL_ACT": 0, "COM_DL_LOSS_T": 10}, {}),
+    PX4: ({"NAV_DLL_ACT": 0, "COM_DL_LOSS_T": 10, "COM_OBL_RC_ACT": 0}, {"COM_OBL_RC_ACT": 4}),
     ARDUCOPTER: ({"FS_GCS_ENABLE": 0, "FS_GCS_TIMEOUT": 9.0}, {"FS_GCS_ENABLE": 5, "FS_GCS_TIMEOUT": 2.0}),
 }
 
