@@ -9,10 +9,10 @@ from pymavlink.dialects.v20 import development as mav
 
 from tests.real.autopilots import PX4
 from tests.real.conftest import Fielder
-from tests.real.test_flights import PX4_CONFIG, flown
+from tests.real.test_flights import PX4_CONFIG, flown_in_time
 from tests.real.witness import Truth, Witness
 
-pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.process, pytest.mark.timeout(1500)]
 
 FED = {  # see docs/real_autopilots.md, "Positions from outside"
     "EKF2_EV_CTRL": 3,
@@ -52,7 +52,7 @@ def feed(witness: Witness, index: int, truth: Truth) -> None:
 @pytest.mark.parametrize("time_number", [1, 2])
 def test_three_px4_with_external_position_fly_close_together(field: Fielder, time_number: int) -> None:
     here = field(PX4, 3, FED, feed, is_alone=True)
-    summary = flown(here, PX4_CONFIG, *CLOSE).summary()
+    summary = flown_in_time(here, PX4_CONFIG, *CLOSE).summary()
     assert summary["violations"] == []
     assert summary["tracking"]["index_after_10s_m"] <= 1.75
     assert summary["separation"]["min_m"] >= 0.87
@@ -62,7 +62,7 @@ def test_three_px4_with_external_position_fly_close_together(field: Fielder, tim
 @pytest.mark.parametrize("time_number", [1, 2])
 def test_three_px4_fly_close_together_by_commitments(field: Fielder, time_number: int) -> None:
     here = field(PX4, 3, FED, feed, is_alone=True)
-    summary = flown(here, PX4_CONFIG, *CLOSE, "--set", "separation.mode=guaranteed").summary()
+    summary = flown_in_time(here, PX4_CONFIG, *CLOSE, "--set", "separation.mode=guaranteed").summary()
     assert summary["violations"] == [], "0.85 m by estimate among them"
     assert summary["tracking"]["index_after_10s_m"] <= 1.25 * INDEX_M
     assert here.witness.min_separation_m() >= 0.79

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from swarmctl.core.types import Phase
 from tests.benches.launches import Launched
+from tests.benches.standstill import STILL_S, stood_still_s
 from tests.real.autopilots import ARDUCOPTER, PX4
 from tests.real.conftest import Field, Fielder
 from tests.real.witness import Seen
@@ -20,6 +22,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 PX4_CONFIG, ARDUPILOT_CONFIG = "configs/px4_udp.toml", "configs/ardupilot_udp.toml"
 LONE_PX4 = ("--set", "swarm.agents=1", "--set", 'vehicles=[{sysid=1, url="udpin://127.0.0.1:14540"}]')
 END_S = 240.0
+MOST_REPEATED = 2  # flights that do not count
 PLACED_S = 120.0
 BODIES_M = 0.65  # tip to tip
 GROUND_S = 40.0  # from the end of a launch until the last vehicle has disarmed itself
@@ -35,6 +38,24 @@ def flown(field: Field, *arguments: str) -> Launched:
     return launched
 
 
+def flown_in_time(field: Field, *arguments: str) -> Launched:
+    """Return a launch as `flown` does; one in which the machine stood still has measured the machine, and is repeated.
+
+    Whatever it has come to: who judges it looks at no result before.
+    """
+    for _ in range(MOST_REPEATED):
+        launched = field.launch(*arguments)
+        launched.end(END_S)
+        field.witness.wait(field.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
+        still_s = stood_still_s(launched.run_dir, field.fleet.count)
+        if still_s < STILL_S:
+            assert launched.process.returncode == 0, launched.text()
+            return launched
+        warnings.warn(f"the machine stood still for {still_s:.3f} s; flown again", stacklevel=2)
+        field.witness.judge_from_now()
+    return flown(field, *arguments)
+
+
 def true_rmse_m(launched: Launched, seen: Seen, agent: int = 0) -> float:
     """Return the RMSE of the true position against the reference, from 10 s of the mission on."""
     table = pq.read_table(Path(launched.run_dir) / f"agent-{agent}.parquet")
@@ -47,7 +68,7 @@ def true_rmse_m(launched: Launched, seen: Seen, agent: int = 0) -> float:
 
 
 def test_a_lone_px4_tracks_its_circle(field: Fielder) -> None:
-    here = field(PX4, 1)
+    here = field(PX4, 1, is_alone=True)
     launched = flown(here, PX4_CONFIG, *LONE_PX4)
     assert launched.summary()["tracking"]["agents"][0]["steady_rmse_m"] < 0.08
     assert true_rmse_m(launched, here.witness.vehicles[0]) < 0.8  # its estimate is 0.3 to 0.6 m off
@@ -88,7 +109,7 @@ def test_a_lone_arducopter_hovers_in_its_built_in_mission(field: Fielder) -> Non
 
 def test_three_arducopters_fly_a_circle_close_together(field: Fielder) -> None:
     here = booted(field, 3)
-    summary = flown(here, THREE_ARDUCOPTERS).summary()
+    summary = flown_in_time(here, THREE_ARDUCOPTERS).summary()
     assert summary["violations"] == []
     assert summary["tracking"]["index_after_10s_m"] < 1.75
     assert here.witness.min_separation_m() > 0.8

@@ -135,6 +135,7 @@ class Witness:
 
     def __init__(self, fleet: Fleet, on_truth: Callable[[Witness, int, Truth], None] | None = None) -> None:
         self.vehicles = [Seen() for _ in range(fleet.count)]
+        self._judged_from_s = 0.0
         self._on_truth = on_truth
         self._fleet = fleet
         self._codec = Codec(255, 190)
@@ -170,6 +171,10 @@ class Witness:
 
     # --- what has been seen ---
 
+    def judge_from_now(self) -> None:
+        """Leave distances until now out of `min_separation_m`."""
+        self._judged_from_s = time.monotonic()
+
     def min_separation_m(self) -> float:
         """Return the least true distance of two vehicles while all were flying."""
         begin_s, end_s = self._all_armed()
@@ -181,7 +186,8 @@ class Witness:
         return float(min(np.linalg.norm(a - b, axis=1)[aloft].min() for a, b in pairs))
 
     def _all_armed(self) -> tuple[float, float]:
-        armed_s = [[t_s for t_s, armed, _ in vehicle.beats if armed] for vehicle in self.vehicles]
+        since_s, seen = self._judged_from_s, self.vehicles
+        armed_s = [[t_s for t_s, armed, _ in vehicle.beats if armed and t_s >= since_s] for vehicle in seen]
         return max(times[0] for times in armed_s), min(times[-1] for times in armed_s)
 
     def highest_m(self, vehicle: int) -> float:
