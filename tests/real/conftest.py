@@ -67,7 +67,7 @@ def network() -> Iterator[Network]:
 
 @pytest.fixture
 def field(network: Network, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fielder]:
-    """Start N vehicles of a kind; skip where no build of it is named."""
+    """Start N vehicles of a kind, alone in the air or not (see `turn`); skip where no build of it is named."""
     fields: list[Field] = []
     turns = contextlib.ExitStack()
 
