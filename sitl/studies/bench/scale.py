@@ -212,7 +212,7 @@ def _chart(growth: Growth) -> Markup:
         counts, costs = growth.counts[fitted], growth.costs[fitted]
         scale = math.exp(float(np.mean(np.log(costs) - growth.exponent * np.log(counts))))
         lines.append(reference_line(counts, scale * counts**growth.exponent, label="fitted"))
-    shown = (0.0, float(growth.counts.max()) * 1.02)
+    shown = (0.0, float(growth.counts.max()) * 1.15)  # room for the name of the axis
     return time_chart(growth.words, lines, shown, from_zero=True, x_unit=growth.over)
 
 
