@@ -29,6 +29,7 @@ from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.run_files import load_run, read_plans
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run
 from swarmctl.telemetry.view.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
+from swarmctl.wall_clock import utc_us
 
 
 def simulate(config: Config, directory: Path) -> int:
@@ -131,7 +132,7 @@ def _run(options: dict[str, Any]) -> int:
     config = load(options["config"], overrides)
     for line in warning_lines(config):
         print(line, file=sys.stderr)
-    directory = create_run_folder(options["run_dir"], config.name, time.time_ns() // 1000)
+    directory = create_run_folder(options["run_dir"], config.name, utc_us())
     code = simulate(config, directory)
     if options["view"]:
         open_viewer(str(directory / RECORDING))

@@ -33,6 +33,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
+from swarmctl.wall_clock import utc_us
 
 HOST = "127.0.0.1"
 LOCAL_PORT = 24580
@@ -132,7 +133,7 @@ def fly(clients: Sequence[Client], seconds: float) -> None:
     while now_us < end_us:
         poller.poll(max(0.0, (min(due) - now_us) * 1e-6))
         now_us = time.monotonic_ns() // 1000
-        offset_us = time.time_ns() // 1000 - now_us
+        offset_us = utc_us() - now_us
         for i, client in enumerate(clients):
             client.drain(offset_us)
             if now_us >= due[i]:

@@ -27,6 +27,7 @@ from swarmctl.ops.orders.order_delivery import Reply, deliver
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
 from swarmctl.telemetry.recording.run_files import CONFIG
 from swarmctl.telemetry.recording.run_folder import create_run_folder
+from swarmctl.wall_clock import utc_us
 
 _READY_S = 120.0  # for the launch to have started every process
 _POLL_S = 0.1
@@ -76,7 +77,7 @@ def launch(config: Config | None = None, folder: str | Path | None = None, *, vi
 
 def _new_folder(config: Config, folder: str | Path | None) -> Path:
     """Return a new run folder that holds the configuration."""
-    directory = create_run_folder(None if folder is None else Path(folder), config.name, time.time_ns() // 1000)
+    directory = create_run_folder(None if folder is None else Path(folder), config.name, utc_us())
     replace_text(directory / CONFIG, dump(config))
     return directory.resolve()
 

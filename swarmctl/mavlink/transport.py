@@ -11,7 +11,6 @@ import re
 import socket
 import struct
 import sys
-import time
 import zlib
 from collections import deque
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from typing import Any, NamedTuple, Protocol
 from swarmctl.errors import StartError
 from swarmctl.mavlink.framing import cut_frames
 from swarmctl.mavlink.latch import Address, Greeting, IsVehicle, Latch, admit_only, anybody, silence
+from swarmctl.wall_clock import utc_us
 
 _MAX_DATAGRAM = 2048
 _CHUNK = 65536
@@ -234,7 +234,7 @@ class UdpTransport:
         for level, kind, value in ancillary:
             if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS:
                 seconds, nanoseconds = _TIMESPEC.unpack(value)
-                age_us: int = time.time_ns() // 1000 - (seconds * 1_000_000 + nanoseconds // 1000)
+                age_us: int = utc_us() - (seconds * 1_000_000 + nanoseconds // 1000)
                 return now_us - max(0, age_us)
         return now_us
 

@@ -37,7 +37,7 @@ class VehicleSetup:
     Attributes:
         ready: everything has been requested and answered since the last reboot.
         restored: every changed parameter has been set back, or could not be.
-        restore_from_us: when the first of them is set back, once that has begun.
+        restore_from_us: when the first of them is set back; None until that is asked for.
     """
 
     def __init__(
@@ -57,8 +57,7 @@ class VehicleSetup:
         self._todo: deque[Command] = deque()
         self._compared = False  # read values have been compared with wanted ones
         self._before: dict[str, Command] = {}  # parameter -> command that restores its original value
-        self._restoring = False
-        self.restore_from_us = 0
+        self.restore_from_us: int | None = None
         self._open: Command | None = None
         self._failed: dict[str, str] = {}  # parameter -> answer of the autopilot
         self._origin_us = 0
@@ -92,7 +91,6 @@ class VehicleSetup:
         None is set within the time in which its dialect may be saving its own: a PX4 can stop of it.
         """
         self._todo = deque(reversed(self._before.values()))
-        self._restoring = True
         self.restore_from_us = now_us + (round(1e6 * self._dialect.restore_after_s) if self._dialect else 0)
 
     def on_result(self, result: CommandResult) -> None:
@@ -101,7 +99,7 @@ class VehicleSetup:
             return
         self._open = None
         name = result.command.name
-        if name and self._restoring:
+        if name and self.restore_from_us is not None:
             self._before.pop(name if result.ok else "", None)
         elif name and not result.ok:
             self._failed[name] = result.text
@@ -112,7 +110,7 @@ class VehicleSetup:
         if self._dialect is None or self._commands.busy:
             return
         self._open = None
-        if self._restoring:
+        if self.restore_from_us is not None:
             self.restored = not self._todo
             if now_us < self.restore_from_us:
                 return

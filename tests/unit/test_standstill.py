@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from tests.benches.standstill import STILL_S, common_gap_s
+from tests.benches.standstill import STILL_S, common_gap_s, stood_still_s
 
 TICK_US = 20_000
 
@@ -23,3 +25,8 @@ def test_only_what_all_have_lost_at_once_counts() -> None:
     assert common_gap_s(all_are) == pytest.approx(0.068)
     one_after_the_other = [ticks(0, 20, 21, 22), ticks(7_000, 50, 51, 52), ticks(12_000, 70, 71, 72)]
     assert common_gap_s(one_after_the_other) < STILL_S
+    assert common_gap_s([ticks(0), ticks(0)[:0]]) == common_gap_s([]) == 0.0
+
+
+def test_a_launch_that_recorded_no_mission_has_not_stood_still(tmp_path: Path) -> None:
+    assert stood_still_s(tmp_path, 3) == 0.0

@@ -10,10 +10,9 @@ in flight. Writes `bench.json`, a list of rows of five keys. `--scale` asks how 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -33,11 +32,11 @@ from sitl.studies.bench.captured import (
     measure_xy,
     times_of,
 )
+from sitl.studies.bench.output import json_rows, write_texts
 from sitl.studies.bench.ticks import PARTS, measure_commitments, measure_ticks
 from swarmctl.control.mpc.solvers.qp import SOLVERS, installed_solvers
 from swarmctl.core.types import Array
-from swarmctl.errors import EXIT_OK, ConfigError
-from swarmctl.files import replace_text
+from swarmctl.errors import EXIT_OK
 
 _BESIDE_PILLAR = 2  # neighbours in the scenario with an obstacle
 _OBSTACLE = ", 1 obstacle"
@@ -162,12 +161,7 @@ def _cells(rows: Sequence[BenchRow], count: int, solver: str, suffix: str) -> li
 
 def write(rows: Sequence[BenchRow], directory: Path) -> Path:
     """Write `bench.json` to `directory`, which is made if necessary, and return its path."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        path = directory / "bench.json"
-        replace_text(path, json.dumps([asdict(row) for row in rows], indent=1) + "\n")
-    except OSError as error:
-        raise ConfigError("--out", [f"{directory}: can't be written: {error.strerror}"]) from error
+    (path,) = write_texts({"bench.json": json_rows(rows)}, directory)
     return path
 
 

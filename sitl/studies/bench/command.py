@@ -28,6 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if problem := _problem(options):
         parser.error(problem)
+    options.agents = options.agents or list(AGENTS)
     from sitl.studies.bench.bench import run
 
     return exit_code_of(partial(run, options))
@@ -46,12 +47,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _problem(options: argparse.Namespace) -> str:
-    """Return which options don't go together, or ""; set what `--scale` measures by default."""
+    """Return which options don't go together, or ""."""
     if not options.scale:
         return "--agents needs --scale" if options.agents else ""
     if options.slsqp is not None or len(options.solver or ()) > 1:
         return "--scale measures one solver, and not SLSQP"
-    options.agents = options.agents or list(AGENTS)
     return ""
 
 

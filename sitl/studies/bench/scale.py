@@ -12,11 +12,10 @@ An exponent is that of cost = a * count ** exponent, by least squares in logarit
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,12 +25,11 @@ from rich.console import Console
 from rich.table import Table
 
 from sitl.lockstep import Lockstep
-from sitl.studies.bench.captured import settled_garbage
+from sitl.studies.bench.captured import settled_garbage, times_of
+from sitl.studies.bench.output import json_rows, write_texts
 from sitl.studies.bench.ticks import get_under_way, measure_ticks, tracks
 from swarmctl.config import Config, load
 from swarmctl.core.types import Array
-from swarmctl.errors import ConfigError
-from swarmctl.files import replace_text
 from swarmctl.telemetry.report.charts import Line, agent_line, reference_line, time_chart
 from swarmctl.telemetry.report.pages import render
 
@@ -65,7 +63,8 @@ class Growth:
     over: str  # what is counted
     counts: Array  # (K,)
     costs: Array  # (K,)
-    exponent: float  # NaN with fewer than two counts
+    factor: float  # of the fitted power; NaN with fewer than two counts
+    exponent: float  # of it
 
     @property
     def words(self) -> str:
@@ -82,8 +81,16 @@ def neighbour_rows(counts: Sequence[int], solver: str, ticks: int, on_count: Cal
     """Measure the tick of one agent among so many neighbours, for each count."""
     rows = []
     for count in counts:
-        tick_ms = measure_ticks(count, [solver], ticks)[solver][:, -1]
-        rows.append(_row("neighbours", solver, count, tick_ms))
+        times = times_of(measure_ticks(count, [solver], ticks)[solver][:, -1])
+        rows.append(
+            ScaleRow(
+                question="neighbours",
+                solver=solver,
+                count=count,
+                tick_p50_ms=round(times.p50_ms, 4),
+                tick_p99_ms=round(times.p99_ms, 4),
+            )
+        )
         on_count()
     return rows
 
@@ -112,28 +119,15 @@ def _swarm_row(count: int, solver: str, ticks: int) -> ScaleRow:
             flight.step()
             tick_ms += [agent.timing.tick_ms for agent in flight.agents if agent is not None]
         spent_s = time.process_time() - began_s
-    flown_s = steps * count / config.agent.rate_hz
-    bytes_s = (_sent_bytes(flight) - sent_before) / flown_s
-    return _row("agents", solver, count, np.array(tick_ms), real_time_per_core=flown_s / spent_s, bytes_s=bytes_s)
-
-
-def _row(
-    question: str,
-    solver: str,
-    count: int,
-    tick_ms: Array,
-    *,
-    real_time_per_core: float | None = None,
-    bytes_s: float | None = None,
-) -> ScaleRow:
+    flown_s, times = steps * count / config.agent.rate_hz, times_of(np.array(tick_ms))
     return ScaleRow(
-        question=question,
+        question="agents",
         solver=solver,
         count=count,
-        tick_p50_ms=round(float(np.percentile(tick_ms, 50)), 4),
-        tick_p99_ms=round(float(np.percentile(tick_ms, 99)), 4),
-        real_time_per_core=None if real_time_per_core is None else round(real_time_per_core, 3),
-        bytes_per_agent_s=None if bytes_s is None else round(bytes_s, 1),
+        tick_p50_ms=round(times.p50_ms, 4),
+        tick_p99_ms=round(times.p99_ms, 4),
+        real_time_per_core=round(flown_s / spent_s, 3),
+        bytes_per_agent_s=round((_sent_bytes(flight) - sent_before) / flown_s, 1),
     )
 
 
@@ -176,16 +170,20 @@ def growths(rows: Sequence[ScaleRow]) -> list[Growth]:
 
 def _growth(title: str, over: str, costs: Mapping[int, float]) -> Growth:
     counts, values = np.array(list(costs), np.float64), np.array(list(costs.values()))
-    return Growth(title=title, over=over, counts=counts, costs=values, exponent=exponent_of(counts, values))
+    factor, exponent = fitted_power(counts, values)
+    return Growth(title=title, over=over, counts=counts, costs=values, factor=factor, exponent=exponent)
 
 
-def exponent_of(counts: Array, costs: Array) -> float:
-    """Return e of costs (K,) = a * counts (K,) ** e by least squares in logarithms; NaN with fewer than two counts."""
+def fitted_power(counts: Array, costs: Array) -> tuple[float, float]:
+    """Return a and e of costs (K,) = a * counts (K,) ** e by least squares in logarithms.
+
+    They are NaN with fewer than two counts that are large enough.
+    """
     fitted = counts >= _SMALLEST
     if np.count_nonzero(fitted) < 2:
-        return math.nan
-    x, y = np.log(counts[fitted]), np.log(costs[fitted])
-    return float(np.sum((x - x.mean()) * (y - y.mean())) / np.sum((x - x.mean()) ** 2))
+        return math.nan, math.nan
+    exponent, log_factor = np.polyfit(np.log(counts[fitted]), np.log(costs[fitted]), 1)
+    return math.exp(log_factor), float(exponent)
 
 
 def write(rows: Sequence[ScaleRow], directory: Path) -> list[Path]:
@@ -194,24 +192,15 @@ def write(rows: Sequence[ScaleRow], directory: Path) -> list[Path]:
     Raises:
         ConfigError: it can't be written.
     """
-    written = [directory / "scale.json", directory / "scale.html"]
     page = render(__package__, "scale.html", rows=rows, charts=[_chart(growth) for growth in growths(rows)])
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        replace_text(written[0], json.dumps([asdict(row) for row in rows], indent=1) + "\n")
-        replace_text(written[1], page)
-    except OSError as error:
-        raise ConfigError("--out", [f"{directory}: can't be written: {error.strerror}"]) from error
-    return written
+    return write_texts({"scale.json": json_rows(rows), "scale.html": page}, directory)
 
 
 def _chart(growth: Growth) -> Markup:
     lines: list[Line] = [agent_line(0, growth.counts, growth.costs, label="measured", marks=True)]
-    fitted = growth.counts >= _SMALLEST
     if math.isfinite(growth.exponent):
-        counts, costs = growth.counts[fitted], growth.costs[fitted]
-        scale = math.exp(float(np.mean(np.log(costs) - growth.exponent * np.log(counts))))
-        lines.append(reference_line(counts, scale * counts**growth.exponent, label="fitted"))
+        counts = growth.counts[growth.counts >= _SMALLEST]
+        lines.append(reference_line(counts, growth.factor * counts**growth.exponent, label="fitted"))
     shown = (0.0, float(growth.counts.max()) * 1.15)  # room for the name of the axis
     return time_chart(growth.words, lines, shown, from_zero=True, x_unit=growth.over)
 

@@ -31,6 +31,7 @@ from sitl.studies.thesis.verdicts import MEANING, counted, counts_text, verdict_
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError
 from swarmctl.process_lifetime import serve_parent
 from swarmctl.telemetry.recording.run_folder import create_run_folder
+from swarmctl.wall_clock import utc_us
 
 TIMING = "timing"  # name of the timing rows for `--only`
 
@@ -176,6 +177,6 @@ def run(options: argparse.Namespace) -> int:
     if options.jobs < 1:
         raise ConfigError("--jobs", [f"{options.jobs}: at least 1 process flies"])
     chosen(options.only, options.plant, options.full)
-    directory = options.out or create_run_folder(None, "reproduce", time.time_ns() // 1000)
+    directory = options.out or create_run_folder(None, "reproduce", utc_us())
     _make(directory)
     return reproduce(options.only, options.plant, options.full, directory, processes=options.jobs)

@@ -23,22 +23,20 @@ class MissionEnd:
     def __init__(self, ports: Ports, mission: MissionState, vehicle_setup: VehicleSetup, alerts: Alerts) -> None:
         self._ports, self._mission, self._vehicle_setup = ports, mission, vehicle_setup
         self._alerts = alerts
-        self._has_begun = False
 
     @property
     def done(self) -> bool:
         """Whether the mission has ended and the autopilot's parameters are restored, or the wait for it timed out."""
-        if not self._has_begun:
+        setup, from_us = self._vehicle_setup, self._vehicle_setup.restore_from_us
+        if from_us is None:
             return False
-        setup = self._vehicle_setup
-        return setup.restored or self._ports.clock.now_us() - setup.restore_from_us > _RESTORE_TIMEOUT_US
+        return setup.restored or self._ports.clock.now_us() - from_us > _RESTORE_TIMEOUT_US
 
     def step(self, now_us: int) -> None:
         """Advance by one tick."""
         if not self._mission.finished:
             return
-        if not self._has_begun:
-            self._has_begun = True
+        if self._vehicle_setup.restore_from_us is None:
             self._vehicle_setup.restore(now_us)
         left = self._vehicle_setup.left_changed
         if left and self.done and self._alerts.put("restore", f"parameters left changed, they were: {left}", now_us):

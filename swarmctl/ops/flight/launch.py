@@ -150,7 +150,7 @@ def started(config: Config, options: LaunchOptions, part: SwarmPart) -> Iterator
 def _run_folder(config: Config, options: LaunchOptions) -> Path:
     from swarmctl.telemetry.recording.run_folder import create_run_folder  # heavy
 
-    directory = create_run_folder(options.run_dir, config.name, time.time_ns() // 1000).resolve()
+    directory = create_run_folder(options.run_dir, config.name, utc_us()).resolve()
     try:
         replace_text(directory / "config.toml", dump(config))
     except OSError as error:

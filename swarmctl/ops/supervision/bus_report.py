@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -12,6 +11,7 @@ from swarmctl.bus.refusals import HARMLESS, IDENTITY, MALFORMED, Refusals
 from swarmctl.bus.silence import SessionWatch
 from swarmctl.bus.topics import STATUS
 from swarmctl.ops.supervision.status_table import Display
+from swarmctl.wall_clock import utc_us
 
 _REOPENED = "another session of the bus has taken over: the one before may have been deaf"
 
@@ -44,11 +44,11 @@ class BusReport:
         """Report what is new: refused messages, the first of each kind in words, and another session."""
         for message in self._bus.refused():
             self._refuse(*message)
-        self._refusals.report(time.time_ns() // 1000)
+        self._refusals.report(utc_us())
         if self._sessions.step() and not self._has_told_reopened:  # while there is nobody, it happens again and again
             self._has_told_reopened = True
             self._display.print_line(_REOPENED)
 
     def _refuse(self, sender: str, topic: str, reason: str) -> None:
-        if self._refusals.add(sender, topic, reason, time.time_ns() // 1000) == 1 and reason not in HARMLESS:
+        if self._refusals.add(sender, topic, reason, utc_us()) == 1 and reason not in HARMLESS:
             self._display.print_line(f"{topic} in the name of {sender} refused: {reason}")

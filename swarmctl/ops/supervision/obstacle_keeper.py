@@ -11,6 +11,7 @@ from swarmctl.bus.bus import Bus
 from swarmctl.bus.messages.json_messages import ObstaclesMessage, decode_obstacles, encode_message, first_list
 from swarmctl.bus.topics import OBSTACLES
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.wall_clock import utc_us
 
 _REPEAT_S = 1.0
 
@@ -28,7 +29,7 @@ class ObstacleKeeper:
 
     def __init__(self, bus: Bus, configured: Sequence[Obstacle]) -> None:
         self._bus = bus
-        self.newest = first_list(configured, time.time_ns() // 1000)
+        self.newest = first_list(configured, utc_us())
         self._said_s = 0.0
 
     def receive(self) -> list[ObstaclesMessage]:
@@ -46,5 +47,5 @@ class ObstacleKeeper:
         now_s = time.monotonic()
         if now_s - self._said_s >= _REPEAT_S:
             self._said_s = now_s
-            told = msgspec.structs.replace(self.newest, utc_us=time.time_ns() // 1000)
+            told = msgspec.structs.replace(self.newest, utc_us=utc_us())
             self._bus.publish(OBSTACLES, encode_message(told))

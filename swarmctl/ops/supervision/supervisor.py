@@ -29,6 +29,7 @@ from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, t
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
 from swarmctl.telemetry.recording.event_log import EventLog
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
+from swarmctl.wall_clock import utc_us
 
 _STEP_S = 0.05
 _FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
@@ -200,7 +201,7 @@ class FlightSupervisor:
         clocks_us = [
             view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in views if view.status is not None
         ]
-        for message in order_messages(numbered(order), agent, time.time_ns() // 1000, clocks_us):
+        for message in order_messages(numbered(order), agent, utc_us(), clocks_us):
             self._bus.publish(topic, message)
 
     def _recover(self, view: AgentView, code: int) -> None:

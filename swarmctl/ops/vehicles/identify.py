@@ -21,6 +21,7 @@ from swarmctl.control.reference.kinds.identify import IdentifyParams
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, StartError
 from swarmctl.ops.flight.launch import LaunchOptions, launch
 from swarmctl.ops.vehicles.vehicle_check import CheckOptions, check
+from swarmctl.wall_clock import utc_us
 
 _UNITS = {
     "delay_s": "s",
@@ -139,7 +140,7 @@ def _model_lines(found: Identified, before: VehicleModelParams) -> Sequence[str]
 def _run_folder(run_dir: Path | None) -> Path:
     from swarmctl.telemetry.recording.run_folder import create_run_folder  # heavy
 
-    return create_run_folder(run_dir, "identify", time.time_ns() // 1000)
+    return create_run_folder(run_dir, "identify", utc_us())
 
 
 def _write(path: Path, text: str) -> None:

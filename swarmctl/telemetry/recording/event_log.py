@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-import time
 from pathlib import Path
 from typing import Any
 
-from swarmctl.wall_clock import monotonic_us
+from swarmctl.wall_clock import monotonic_us, utc_us
 
 
 class EventLog:
@@ -19,6 +18,6 @@ class EventLog:
 
     def write(self, event: str, **fields: Any) -> None:
         """Append one row with both clocks."""
-        stamp = {"utc_us": time.time_ns() // 1000, "t_us": monotonic_us(), "source": self._source, "event": event}
+        stamp = {"utc_us": utc_us(), "t_us": monotonic_us(), "source": self._source, "event": event}
         with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({**stamp, **fields}) + "\n")

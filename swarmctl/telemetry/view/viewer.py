@@ -26,6 +26,7 @@ from swarmctl.process_lifetime import StopRequest, die_with_parent
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 from swarmctl.telemetry.view.recordings import APPLICATION, RECORDING, has_display, open_viewer
 from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_ports
+from swarmctl.wall_clock import utc_us
 
 URL_FILE = "viewer.url"
 _SERVER_MEMORY = "512MiB"  # history for viewers that connect late
@@ -92,7 +93,7 @@ def _run(options: argparse.Namespace, flight: ViewedFlight, stop: StopRequest) -
             listen,
             identity=identity,
             max_age_us=FOR_OPERATORS_US,
-            utc_us=lambda: time.time_ns() // 1000,
+            utc_us=utc_us,
         )
 
     bus = _interruptible(join, stop)

@@ -288,8 +288,8 @@ def test_the_exponent_of_a_power_is_found_whatever_zero_and_one_cost(exponent: f
     counts = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0])
     costs = 3.0 * np.maximum(counts, 1.0) ** exponent
     costs[:2] = 100.0
-    assert scale.exponent_of(counts, costs) == pytest.approx(exponent, abs=1e-9)
-    assert np.isnan(scale.exponent_of(counts[:3], costs[:3])), "two counts are needed"
+    assert scale.fitted_power(counts, costs) == pytest.approx((3.0, exponent), abs=1e-9)
+    assert np.isnan(scale.fitted_power(counts[:3], costs[:3])).all(), "two counts are needed"
 
 
 @pytest.mark.usefixtures("quick")

@@ -1,0 +1,32 @@
+"""What `bench` leaves in the folder of its `--out`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from swarmctl.errors import ConfigError
+from swarmctl.files import replace_text
+
+
+def json_rows(rows: Sequence[Any]) -> str:
+    """Return rows, each a dataclass, as a JSON list."""
+    return json.dumps([asdict(row) for row in rows], indent=1) + "\n"
+
+
+def write_texts(texts: Mapping[str, str], directory: Path) -> list[Path]:
+    """Write files by name to `directory`, which is made if necessary, and return their paths.
+
+    Raises:
+        ConfigError: one can't be written.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            replace_text(directory / name, text)
+    except OSError as error:
+        raise ConfigError("--out", [f"{directory}: can't be written: {error.strerror}"]) from error
+    return [directory / name for name in texts]
