@@ -49,7 +49,7 @@ class AutoFlight:
 
     Attributes:
         phase: taking off, landing, or neither.
-        done: TAKEOFF has reached its height.
+        next_mode: mode that flight changes to: TAKEOFF has reached its height, or an item asks for a return.
         mission_finished: the last item has been flown.
         reached: mission items reached and not yet reported.
         takeoff_alt_amsl_m: height of NAV_TAKEOFF; None: MIS_TAKEOFF_ALT above home.
@@ -73,7 +73,8 @@ class AutoFlight:
     def reset(self) -> None:
         """Reset to the state after boot."""
         self.phase = Phase.CRUISE
-        self.done = self.mission_finished = False
+        self.next_mode: Px4Mode | None = None
+        self.mission_finished = False
         self.reached: list[int] = []
         self.takeoff_alt_amsl_m: float | None = None
         self._takeoff_z_m: float | None = None
@@ -88,7 +89,7 @@ class AutoFlight:
     def engage(self, mode: Px4Mode, estimate: Estimate, *, fresh: bool) -> None:
         """Begin a mode at the vehicle's place; see `Navigator.engage` for `fresh`."""
         self.phase = Phase.CRUISE
-        self.done = False
+        self.next_mode = None
         self._takeoff_z_m = self._return_z_m = self._climb_xy_m = self._goal_ned_m = self._inside_us = None
         self._climbed = False
         self._navigator.engage(estimate, fresh=fresh)
@@ -150,7 +151,7 @@ class AutoFlight:
         if estimate.on_ground and since_s < RAMP_S:
             return Command(q_nb=IDLE.q_nb, thrust_01=self._navigator.hover_01 * since_s / RAMP_S)
         if estimate.pos_ned_m[2] <= self._takeoff_z_m + TAKEOFF_REACHED_M:
-            self.done, self.phase = True, Phase.CRUISE
+            self.next_mode, self.phase = Px4Mode.AUTO_LOITER, Phase.CRUISE
             climbed = estimate.pos_ned_m[2] > self._takeoff_z_m - 1.0  # false when it started above it
             self._navigator.engage(estimate, fresh=False)
             if climbed:
@@ -212,7 +213,8 @@ class AutoFlight:
         if item.command == NAV_TAKEOFF or estimate.on_ground:
             return self._fly_takeoff(item, estimate, home, armed_us, now_us=now_us, dt_s=dt_s)
         if item.command == NAV_RETURN:
-            return self._return(estimate, home, dt_s)
+            self.next_mode = Px4Mode.AUTO_RTL
+            return self._navigator.hold(estimate, dt_s)
         if item.command == NAV_DELAY:
             return self._wait(item, estimate, now_us, dt_s)
         goal = self._place(item, home, estimate)
@@ -230,15 +232,15 @@ class AutoFlight:
         self, item: Item, estimate: Estimate, home: Ned, armed_us: int, *, now_us: int, dt_s: float
     ) -> Command:
         """Fly NAV_TAKEOFF; a mission that begins on the ground with another item takes off first, too."""
-        if item.command in (NAV_LAND, NAV_RETURN) and self.phase == Phase.LANDING:
+        if item.command == NAV_LAND and self.phase == Phase.LANDING:
             self._advance()
             return IDLE
         target_z_m = self._place(item, home, estimate)[2]
         if item.command != NAV_TAKEOFF:
             target_z_m = home[2] - self._parameters.real("MIS_TAKEOFF_ALT")
         command = self._take_off(estimate, home, target_z_m, armed_us, now_us=now_us, dt_s=dt_s)
-        if self.done:
-            self.done, self._takeoff_z_m = False, None
+        if self.next_mode is not None:
+            self.next_mode = self._takeoff_z_m = None
             if item.command == NAV_TAKEOFF:
                 self._advance()
         return command

@@ -358,9 +358,12 @@ class Autopilot:
         if not self.has_position and not estimate.on_ground:
             return self._navigator.descend_blind(estimate, dt_s)
         command = self.flight.fly(self.mode, estimate, self.home_ned_m, self._armed_us, now_us=now_us, dt_s=dt_s)
-        if self.flight.done:
-            self.flight.done = False
-            self.mode = self.intended = self._resting_mode = Px4Mode.AUTO_LOITER
+        match self.flight.next_mode:
+            case Px4Mode.AUTO_LOITER:  # a take-off is complete
+                self.flight.next_mode = None
+                self.mode = self.intended = self._resting_mode = Px4Mode.AUTO_LOITER
+            case Px4Mode.AUTO_RTL:  # an item of the mission asks for it
+                self.set_mode(Px4Mode.AUTO_RTL, now_us)
         return command
 
     # --- failsafes ---

@@ -231,6 +231,7 @@ RUN_ROWS = (
             go(4, 4),
             mode(M_MISSION),
             sees("MISSION_ITEM_REACHED", 20.0, seq=Between(1, 2)),  # a return has no place to reach
+            sees("CURRENT_MODE", 21.0, custom_mode=M_RTL),
             *clear(),
         ),
         params={"NAV_ACC_RAD": 2.0},

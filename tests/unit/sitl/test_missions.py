@@ -177,6 +177,15 @@ def test_a_jump_repeats_as_often_as_told() -> None:
     assert [m.seq for m in bench.said(REACHED)] == [0, 1, 0, 1, 0, 1, 2]
 
 
+def test_a_return_in_a_mission_changes_the_mode() -> None:
+    bench = taken_off("x500")
+    assert upload(bench, [item(bench, 0, 16, (2.5, 0.0)), item(bench, 1, 20, frame=2)]) == 0
+    bench.mode(4, 4)
+    bench.run(6.0)
+    assert bench.pilot.mode == bench.pilot.intended == RTL
+    assert [m.seq for m in bench.said(REACHED)] == [0]
+
+
 def test_reposition_flies_there_and_holds() -> None:
     bench = taken_off("x500")
     origin = bench.pilot.boot.origin
