@@ -235,6 +235,7 @@ RUN_ROWS = (
             *clear(),
         ),
         params={"NAV_ACC_RAD": 2.0},
+        spoils=True,  # PX4 in HOLD goes on to the height at which a return has begun to climb
     ),
     Row(
         name="DO_REPOSITION flies there in LOITER",
@@ -320,6 +321,7 @@ BATTERY_ROWS = (
             sees("HEARTBEAT", 9.5, custom_mode=M_LAND, system_status=5),
         ),
         params={"COM_LOW_BAT_ACT": 2},
+        spoils=True,  # the battery stays critical for a while after its limits are put back: PX4 then returns
     ),
     Row(
         name="a critical battery only warns unless told otherwise",
@@ -331,6 +333,7 @@ BATTERY_ROWS = (
             always("CURRENT_MODE", 7.0, 13, custom_mode=M_LOITER),
         ),
         params={"COM_LOW_BAT_ACT": 0},
+        spoils=True,  # as above
     ),
 )
 

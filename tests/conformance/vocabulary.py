@@ -348,7 +348,7 @@ class Row:
         start: where the vehicle is put first.
         steps: played in order; the first that is not met ends the row.
         params: set before the start state is entered, restored afterwards.
-        spoils: leaves a vehicle only a reboot makes usable again.
+        spoils: leaves a vehicle that only a reboot makes fit for any other row.
         untouched: needs a vehicle that has had no setpoint, and has not flown, since its start.
         needs_gcs: needs the second link.
         not_by_url: why it can't be played against a vehicle given by URL; empty when it can.
