@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight
-from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
 
 COMMITTED_M = 0.8

@@ -15,10 +15,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from sitl.studies.campaign.command import main
+from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight, fly
 from sitl.studies.campaign.page import REPORT
 from sitl.studies.campaign.quick import QUICK
-from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.store import ROWS
 from sitl.studies.campaign.trials import Cell, Row, Trial, trial_of
 from swarmctl.core.types import Phase

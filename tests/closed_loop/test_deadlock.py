@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.layouts import least_sum_m, ring
-from sitl.studies.campaign.scenarios import layout_of
+from sitl.studies.campaign.conditions.layouts import least_sum_m, ring
+from sitl.studies.campaign.conditions.scenarios import layout_of
 from swarmctl.config import load
 from swarmctl.control.reference.kinds import goto
 from swarmctl.core.closest_pair import closest_pair_m

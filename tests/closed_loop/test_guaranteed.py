@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
+from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight
-from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.peer_clocks import PeerClocks

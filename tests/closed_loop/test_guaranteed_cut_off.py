@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sitl.studies.campaign.events import Freeze, ScenarioEvent, Split
+from sitl.studies.campaign.conditions.events import Freeze, ScenarioEvent, Split
+from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight, drawn
-from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.agent.planning import coordination
 from swarmctl.agent.planning.coordination import Coordination

@@ -9,7 +9,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.collision_monitor import CollisionMonitor
-from sitl.studies.campaign.events import SimulatorFault
+from sitl.studies.campaign.conditions.events import SimulatorFault
 from sitl.studies.campaign.flight import TrialFlight, drawn
 from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.bus.peer_clocks import PeerClocks

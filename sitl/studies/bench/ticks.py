@@ -15,8 +15,8 @@ import numpy as np
 from sitl.lockstep import Lockstep
 from sitl.studies.bench.captured import settled_garbage
 from sitl.studies.bench.formation import Formation, formation_config
+from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import config_of
-from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell
 from swarmctl.config import Config
 from swarmctl.core.recorded.tick_record import TickTiming

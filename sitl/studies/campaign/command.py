@@ -23,13 +23,13 @@ from typing import Any, TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from sitl.studies.campaign.disturbances import DISTURBANCES, NONE
-from sitl.studies.campaign.factors import NOISES, PROTECTIONS
+from sitl.studies.campaign.conditions.disturbances import DISTURBANCES, NONE
+from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS
+from sitl.studies.campaign.conditions.scenarios import AIRFRAMES, SCENARIOS
 from sitl.studies.campaign.flight import config_of, drawn
 from sitl.studies.campaign.page import share_text, write_page
 from sitl.studies.campaign.progress import collect
 from sitl.studies.campaign.quick import QUICK
-from sitl.studies.campaign.scenarios import AIRFRAMES, SCENARIOS
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.store import Store
 from sitl.studies.campaign.summary import summaries

@@ -12,10 +12,10 @@ import numpy as np
 
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.collision_monitor import CollisionMonitor
-from sitl.studies.campaign.disturbances import disturbed
-from sitl.studies.campaign.factors import NOISES, PROTECTIONS, UNCOOPERATIVE, wind_settings
-from sitl.studies.campaign.layouts import least_sum_m
-from sitl.studies.campaign.scenarios import AIRFRAMES, SCENARIOS, Layout, layout_of, settings_of
+from sitl.studies.campaign.conditions.disturbances import disturbed
+from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS, UNCOOPERATIVE, wind_settings
+from sitl.studies.campaign.conditions.layouts import least_sum_m
+from sitl.studies.campaign.conditions.scenarios import AIRFRAMES, SCENARIOS, Layout, layout_of, settings_of
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.trials import Cell, Row, Trial
 from swarmctl.config import Config, load

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from sitl.studies.campaign.disturbances import NONE
-from sitl.studies.campaign.scenarios import SCENARIOS
+from sitl.studies.campaign.conditions.disturbances import NONE
+from sitl.studies.campaign.conditions.scenarios import SCENARIOS
 from sitl.studies.campaign.summary import CellSummary, Share, summaries
 from sitl.studies.campaign.trials import Row, trial_of
 from swarmctl.files import replace_text

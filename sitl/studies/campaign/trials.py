@@ -14,15 +14,15 @@ import pyarrow as pa
 class Cell:
     """One combination of conditions, flown with many seeds."""
 
-    scenario: str  # of sitl.studies.campaign.scenarios.SCENARIOS
+    scenario: str  # of sitl.studies.campaign.conditions.scenarios.SCENARIOS
     agents: int
     delay_ms: float  # of every message on the bus, on top of one tick
     loss: float  # 0..1, probability that one receiver misses one message of an unreliable topic
-    noise: str  # of sitl.studies.campaign.factors.NOISES
+    noise: str  # of sitl.studies.campaign.conditions.factors.NOISES
     wind_m_s: float  # steady, from the west, with Dryden turbulence of as much
-    protections: str  # of sitl.studies.campaign.factors.PROTECTIONS
-    airframe: str = "own"  # of sitl.studies.campaign.scenarios.AIRFRAMES
-    disturbance: str = "none"  # of sitl.studies.campaign.disturbances.DISTURBANCES, perhaps with :strength
+    protections: str  # of sitl.studies.campaign.conditions.factors.PROTECTIONS
+    airframe: str = "own"  # of sitl.studies.campaign.conditions.scenarios.AIRFRAMES
+    disturbance: str = "none"  # of sitl.studies.campaign.conditions.disturbances.DISTURBANCES, perhaps with :strength
     sets: str = ""  # further key=value settings, separated by spaces
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sitl.studies.campaign.layouts import least_sum_m
+from sitl.studies.campaign.conditions.layouts import least_sum_m
 from swarmctl.control.reference.goal_assignment import ROOM, arrangement, assigned_goals_ned_m
 from swarmctl.control.reference.kind import MOVING_ROOM
 from swarmctl.control.reference.kinds.goto import OUTER_DELAY_S_M, GotoParams

@@ -11,12 +11,12 @@ import pytest
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.collision_monitor import CollisionMonitor
 from sitl.studies.campaign.command import main
-from sitl.studies.campaign.disturbances import DISTURBANCES, NONE, disturbed
-from sitl.studies.campaign.events import Appearance
-from sitl.studies.campaign.factors import NOISES, PROTECTIONS
+from sitl.studies.campaign.conditions.disturbances import DISTURBANCES, NONE, disturbed
+from sitl.studies.campaign.conditions.events import Appearance
+from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS
+from sitl.studies.campaign.conditions.layouts import least_sum_m
+from sitl.studies.campaign.conditions.scenarios import SCENARIOS, layout_of
 from sitl.studies.campaign.flight import config_of, drawn
-from sitl.studies.campaign.layouts import least_sum_m
-from sitl.studies.campaign.scenarios import SCENARIOS, layout_of
 from sitl.studies.campaign.store import Store
 from sitl.studies.campaign.trials import SCHEMA, Cell, Row, Trial, cells
 from sitl.studies.campaign.worker_pool import on_cluster, on_this_machine

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.events import Freeze, ScenarioEvent, Split
+from sitl.studies.campaign.conditions.events import Freeze, ScenarioEvent, Split
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.topics import OPERATOR
 from swarmctl.config import load

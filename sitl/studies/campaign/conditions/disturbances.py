@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sitl.studies.campaign.events import Freeze, OneWayCut, ScenarioEvent, SimulatorFault, Split
-from sitl.studies.campaign.scenarios import Layout
+from sitl.studies.campaign.conditions.events import Freeze, OneWayCut, ScenarioEvent, SimulatorFault, Split
+from sitl.studies.campaign.conditions.scenarios import Layout
 from swarmctl.core.clock import ClockError
 from swarmctl.simulator_config import FaultParams
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sitl.studies.campaign.events import Appearance, Death, Partition, ScenarioEvent
-from sitl.studies.campaign.layouts import far_goals, forest, ring, scattered, walls
+from sitl.studies.campaign.conditions.events import Appearance, Death, Partition, ScenarioEvent
+from sitl.studies.campaign.conditions.layouts import far_goals, forest, ring, scattered, walls
 from swarmctl.core.clock import ClockError
 from swarmctl.core.types import Array
 
