@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import os
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO
 
 import psutil
 import pytest
@@ -18,6 +14,7 @@ import pytest
 from tests.benches.launches import Launched
 from tests.real.autopilots import Fleet, Kind
 from tests.real.network import Network, own_network
+from tests.real.turns import locked, turn
 from tests.real.witness import Truth, Witness
 
 
@@ -56,7 +53,6 @@ class Field:
 
 
 Fielder = Callable[..., Field]
-LOOK_S = 0.2
 
 
 @pytest.fixture
@@ -91,24 +87,6 @@ def field(network: Network, tmp_path: Path, tmp_path_factory: pytest.TempPathFac
     turns.close()
 
 
-@contextlib.contextmanager
-def turn(shared: Path, is_alone: bool) -> Iterator[None]:
-    """Wait until fewer flights are in the air than this machine has processors: lanes share that folder.
-
-    A flight whose accuracy or violations are judged waits until there is no other: two of them, each with its agents,
-    take turns of the processors, and what is measured then is how late their ticks are. Nobody passes who waits.
-    """
-    with contextlib.ExitStack() as stack:
-        names = [shared / f"flight-{i}.lock" for i in range(len(os.sched_getaffinity(0)))]
-        files = [stack.enter_context(name.open("w")) for name in names]
-        wanted = [[file] for file in files] if is_alone else [files]  # each of them, or any one
-        with (shared / "next-flight.lock").open("w") as gate:
-            for choice in ([gate], *wanted):
-                while not any(locked(file) for file in choice):
-                    time.sleep(LOOK_S)
-        yield
-
-
 def require(kind: Kind, network: Network, count: int) -> None:
     """Skip without a build; fail where a named build does not exist."""
     if kind.binary is None:
@@ -128,12 +106,3 @@ def held(lock: Path) -> bool:
         return False
     with lock.open("r+") as file:
         return not locked(file)
-
-
-def locked(file: IO[str]) -> bool:
-    """Lock a file, until it is closed; return False where another process has."""
-    try:
-        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True

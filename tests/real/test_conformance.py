@@ -19,8 +19,9 @@ from tests.process.test_readme import ROOT
 from tests.real.autopilots import PX4
 from tests.real.conftest import require
 from tests.real.network import Network, own_network
+from tests.real.turns import row_turn
 
-pytestmark = [pytest.mark.process, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.process, pytest.mark.timeout(1500)]
 
 URL, GCS_URL = "udpin://127.0.0.1:14540", "udpin://127.0.0.1:14550"
 _PRIORITY = 12  # above launched agents, at 10, that fly in other lanes
@@ -43,6 +44,13 @@ def player(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Player]:
             partner = ByUrl(URL, GCS_URL, line)
         yield Player(Dialogue(partner))
         partner.close()
+
+
+@pytest.fixture(autouse=True)
+def beside_no_judged_flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Wait for one's turn."""
+    with row_turn(tmp_path_factory.getbasetemp().parent):
+        yield
 
 
 def test_every_stream_comes_at_its_rate(network: Network, tmp_path: Path) -> None:
