@@ -41,6 +41,9 @@ class Partner(Protocol):
 
     def can_restart(self) -> bool: ...
 
+    def stop(self) -> None:
+        """Power it off, until it is restarted; only where it can be."""
+
     def close(self) -> None: ...
 
 
@@ -82,6 +85,9 @@ class InProcess:
 
     def can_restart(self) -> bool:
         return True
+
+    def stop(self) -> None:
+        return  # its time stands still by itself
 
     def now_s(self) -> float:
         return self._clock.now_us() * 1e-6
@@ -173,7 +179,7 @@ class ByUrl:
         return bool(self._restart_command)
 
     def restart(self, booting: bool) -> None:
-        self._stop()
+        self.stop()
         for link in self.links.values():
             link.receive(0)  # what the last one still said
         self._clock.started()
@@ -185,13 +191,14 @@ class ByUrl:
     def advance(self) -> None:
         time.sleep(self.PAUSE_S)
 
-    def _stop(self) -> None:
+    def stop(self) -> None:
+        """Power it off, until it is restarted."""
         if self._process is not None:
             self._process.terminate()
             self._process.wait(timeout=10.0)
             self._process = None
 
     def close(self) -> None:
-        self._stop()
+        self.stop()
         for link in self.links.values():
             link.close()

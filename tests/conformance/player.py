@@ -39,6 +39,11 @@ class Player:
         self._changed: set[str] = set()  # of these, since they were last restored
         self._spoilt = False
 
+    def put_away(self) -> None:
+        """Power the vehicle off; the next row restarts it."""
+        self.dialogue.partner.stop()
+        self._spoilt = True
+
     def play(self, row: v.Row) -> None:
         """Raises `Deviation` at the first step that is not met."""
         self.prepare(row)

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.process
 
 ROOT = Path(__file__).parents[2]
 WAITS_S, SOON_S = 1.0, 10.0
-TURNS = {"flight": "turn(shared, False)", "judged": "turn(shared, True)", "row": "row_turn(shared)"}
+TURNS = {"flight": "turn(shared, False)", "judged": "turn(shared, True)", "row": "row_turn(shared, lambda: None)"}
 TAKES = """
 import sys
 from pathlib import Path

@@ -47,9 +47,15 @@ def player(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Player]:
 
 
 @pytest.fixture(autouse=True)
-def beside_no_judged_flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Wait for one's turn."""
-    with row_turn(tmp_path_factory.getbasetemp().parent):
+def beside_no_judged_flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Wait for one's turn; the vehicle of the rows before neither flies on meanwhile nor takes processor time."""
+    plays_rows = "player" in request.fixturenames
+
+    def put_away() -> None:
+        if plays_rows:
+            request.getfixturevalue("player").put_away()
+
+    with row_turn(tmp_path_factory.getbasetemp().parent, put_away):
         yield
 
 

@@ -9,7 +9,7 @@ import contextlib
 import fcntl
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -32,18 +32,24 @@ def turn(shared: Path, is_alone: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def row_turn(shared: Path) -> Iterator[None]:
-    """Wait until no flight is judged; rows are played side by side."""
+def row_turn(shared: Path, while_waiting: Callable[[], None]) -> Iterator[None]:
+    """Wait until no flight is judged; rows are played side by side. `while_waiting` is called at every look."""
     with _rows(shared).open("a+") as rows:
-        pass_gate(shared, [[rows]], fcntl.LOCK_SH)
+        pass_gate(shared, [[rows]], fcntl.LOCK_SH, while_waiting)
         yield
 
 
-def pass_gate(shared: Path, wanted: Sequence[Sequence[IO[str]]], kind: int = fcntl.LOCK_EX) -> None:
+def pass_gate(
+    shared: Path,
+    wanted: Sequence[Sequence[IO[str]]],
+    kind: int = fcntl.LOCK_EX,
+    while_waiting: Callable[[], None] = lambda: None,
+) -> None:
     """Lock any one file of each choice, while nobody else passes."""
     with (shared / "gate.lock").open("a+") as gate:
         for choice, how in [([gate], fcntl.LOCK_EX), *((choice, kind) for choice in wanted)]:
             while not any(locked(file, how) for file in choice):
+                while_waiting()
                 time.sleep(LOOK_S)
 
 
