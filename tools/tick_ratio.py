@@ -24,6 +24,7 @@ from statistics import quantiles
 ROOT = Path(__file__).parents[1]
 BASELINE = Path(__file__).parent / "tick_baseline"
 TURNS = 30
+LIMIT = 1.15  # times the older cost
 STEPS = 50  # of a turn: a second
 UNDER_WAY_STEPS = 400  # before the first turn: all agents are on the circle
 ENDLESS = "mission.duration_s=3600"
@@ -113,7 +114,7 @@ def main() -> int:
     """Compare each flight and print a line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--base", metavar="COMMIT", default=BASELINE.read_text().strip())
-    parser.add_argument("--limit", metavar="RATIO", type=float, default=1.15)
+    parser.add_argument("--limit", metavar="RATIO", type=float, default=LIMIT)
     parser.add_argument("--turns", metavar="N", type=int, default=TURNS)
     parser.add_argument("--fly", metavar="SET", nargs="+", help=argparse.SUPPRESS)
     asked = parser.parse_args()

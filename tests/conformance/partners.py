@@ -42,7 +42,7 @@ class Partner(Protocol):
     def can_restart(self) -> bool: ...
 
     def stop(self) -> None:
-        """Power it off, until it is restarted; only where it can be."""
+        """Power it off until it is restarted; one that can't be restarted stays on."""
 
     def close(self) -> None: ...
 
@@ -87,7 +87,7 @@ class InProcess:
         return True
 
     def stop(self) -> None:
-        return  # its time stands still by itself
+        return  # without `advance` no time passes for it
 
     def now_s(self) -> float:
         return self._clock.now_us() * 1e-6
@@ -192,7 +192,7 @@ class ByUrl:
         time.sleep(self.PAUSE_S)
 
     def stop(self) -> None:
-        """Power it off, until it is restarted."""
+        """Power it off until it is restarted; one that somebody else has started stays on."""
         if self._process is not None:
             self._process.terminate()
             self._process.wait(timeout=10.0)

@@ -333,7 +333,7 @@ BATTERY_ROWS = (
             always("CURRENT_MODE", 7.0, 13, custom_mode=M_LOITER),
         ),
         params={"COM_LOW_BAT_ACT": 0},
-        spoils=True,  # as above
+        spoils=True,  # the battery stays critical for a while, as in the row before
     ),
 )
 

@@ -12,7 +12,6 @@ import pytest
 pytestmark = pytest.mark.process
 
 ROOT = Path(__file__).parents[2]
-LIMIT = 1.15
 SLOWER = """
 
 def _slower(step):
@@ -47,7 +46,7 @@ def test_a_slower_tick_is_seen(
     monkeypatch: pytest.MonkeyPatch, copied: Callable[[str], Path], appended: str, is_slower: bool
 ) -> None:
     monkeypatch.syspath_prepend(ROOT / "tools")
-    from tick_ratio import FLIGHTS, ratios
+    from tick_ratio import FLIGHTS, LIMIT, ratios
 
     found = ratios(copied(appended), ROOT, FLIGHTS["best effort"], turns=6)
     assert (median(found) > LIMIT) == is_slower

@@ -20,8 +20,8 @@ LOOK_S = 0.2
 def turn(shared: Path, is_alone: bool) -> Iterator[None]:
     """Wait until fewer flights are in the air than this machine has processors.
 
-    A flight whose accuracy or violations are judged waits until there is no other, and no row is played: two of them,
-    each with its agents, take turns of the processors, and what is measured then is how late their ticks are.
+    A flight whose accuracy or violations are judged waits until there is no other, and no row is played: beside others
+    it shares the processors, and what is measured then is how late its ticks are.
     """
     with contextlib.ExitStack() as stack:
         names = [shared / f"flight-{i}.lock" for i in range(len(os.sched_getaffinity(0)))]
