@@ -39,7 +39,7 @@ from swarmctl.bus.messages.json_messages import (
     decode_status,
     encode_message,
 )
-from swarmctl.bus.messages.path_messages import decode_path
+from swarmctl.bus.messages.path_messages import decode_path, encode_path
 from swarmctl.bus.network.hosts import roster_of
 from swarmctl.bus.network.seals import KEY_BYTES, Sealer, SealVerifier
 from swarmctl.bus.relay import decode_relay, encode_relay
@@ -177,6 +177,7 @@ def targets(folder: Path) -> dict[str, Target]:
     sent = flown_bytes(folder / "flight")
     rng = random.Random(1)
     seeds = {name: rng.sample(all_, min(SEEDS_KEPT, len(all_))) for name, all_ in sent.items()}
+    seeds["path"] += [encode_path(path, compact=True) for path in map(decode_path, seeds["path"]) if path]
     codec, key = Codec(255, 190), SigningKey(bytes(range(32)))
     channel = SigningChannel(key, AGENT_LINK, lambda: 1_800_000_000_000_000)
     signed = [channel.sign(frame) for frame in seeds["mavlink"]]

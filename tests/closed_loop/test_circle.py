@@ -59,11 +59,14 @@ def test_negative_control_agents_that_ignore_each_other_collide(fly: Fly) -> Non
     assert alone.separation_m() < 0.3
 
 
-def test_paths_shared_by_event_cost_a_quarter_of_the_traffic_and_no_separation(circle: Flight, fly: Fly) -> None:
-    by_event = fly("agent.path_sharing.error_m=0.002", "sitl.start=air", "mission.duration_s=8", until=mission_is_over)
+def test_compact_paths_shared_by_event_cost_a_tenth_of_the_traffic_and_no_separation(circle: Flight, fly: Fly) -> None:
+    sparing = "agent.path_sharing={error_m=0.002,compact=true}"
+    by_event = fly(sparing, "sitl.start=air", "mission.duration_s=8", until=mission_is_over)
     for agent, flown in zip(range(3), by_event.lockstep.agents, strict=True):
         assert flown is not None
-        assert flown.sent["path"]["messages"] <= 0.4 * len(by_event.ticks(agent))
+        sent = flown.sent["path"]
+        assert sent["messages"] <= 0.4 * len(by_event.ticks(agent))
+        assert sent["bytes"] <= 200 * sent["messages"]
     assert by_event.separation_m() >= 0.85
     first_m = 0.0
     for agent in range(3):

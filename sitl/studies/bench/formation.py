@@ -191,7 +191,7 @@ class Formation:
                 margin_m=0.0,
                 pos_ned_m=path,
             )
-            bus.publish(topics.PATH, encode_path(message))
+            bus.publish(topics.PATH, encode_path(message, compact=self._config.agent.path_sharing.compact))
             if now_us % _STATUS_EVERY_US == 0:
                 bus.publish(topics.STATUS, encode_message(self._status(i + 1, began_s >= 0.0, utc_us)))
         if now_us % _OBSTACLES_EVERY_US == 0:

@@ -62,7 +62,7 @@ class PathPublisher:
         margin_m = min(MAX_MARGIN_M, sum((*margins_m, self._gust.margin_m)))
         path = self._sharing.choose(self._path(state, flown, seq, margin_m))
         if path is not None:
-            self._ports.bus.publish(topics.PATH, encode_path(path))
+            self._ports.bus.publish(topics.PATH, encode_path(path, compact=self._setup.params.path_sharing.compact))
 
     def _path(self, state: VehicleState, flown: Plan | None, seq: int, margin_m: float) -> PredictedPath:
         if flown is not None:

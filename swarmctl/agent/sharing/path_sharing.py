@@ -13,10 +13,11 @@ from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
 
 
 class PathSharingParams(Params):
-    """Parameters of event-triggered sharing."""
+    """Sets when predicted paths are shared, and in how many bytes."""
 
     error_m: float = Field(0.0, ge=0, le=0.5)  # by which peers' copy of the path may be off now; 0: share every tick
     heartbeat_s: float = Field(0.1, gt=0, le=0.25)  # peers' copy is never older; they widen distances with its age
+    compact: bool = False  # a third of the bytes, for radio links: points are rounded, by less than a millimetre
 
 
 class PathSharing:

@@ -1,6 +1,10 @@
-"""Bytes of predicted paths: a little-endian struct header and float32 points.
+"""Bytes of predicted paths: a little-endian struct header, and points as float32 or compact.
 
-A field more in the header is a new `PATH_VERSION`, which receivers of another version refuse.
+Compact points are whole multiples of a unit, a power of two between 15 micrometres and a millimetre: the first one, the
+first step, and by how much each step differs from the one before, a signed byte for each axis. Those differences are
+the acceleration, which is small where positions are not: 41 points take 177 bytes, as float32 528.
+
+A field more in the header is a new version, which receivers that do not know it refuse.
 """
 
 from __future__ import annotations
@@ -10,48 +14,91 @@ import struct
 
 import numpy as np
 
-from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
+from swarmctl.core.types import MAX_MARGIN_M, Array, PredictedPath
 
-PATH_VERSION = 1
+FLOAT_VERSION = 1
+COMPACT_VERSION = 2
 MAX_POINTS = 250
 _HEADER = struct.Struct(
-    "<2sBBIIIqifBB2x"
-)  # magic, version, flags, agent, boot, seq, t0, dt, margin, points, own length
+    "<2sBBIIIqifBBbx"
+)  # magic, version, flags, agent, boot, seq, t0, dt, margin, points, own length, exponent of the unit
 _MAGIC = b"SP"
 _NUMBER = np.dtype("<f4")
+_BEGIN, _BEND = np.dtype("<i4"), np.dtype("i1")
+_BEGIN_BYTES = 6 * _BEGIN.itemsize  # first point and first step
+_FINEST, _COARSEST = -16, -10  # exponents
+_FARTHEST_M = 2.0 ** (30 + _FINEST)  # 16 km; a step may be twice as long
+_LARGEST_BEND = 125  # units; two fewer than fit, by which rounding positions may change a difference of steps
+_ROUNDING_01 = 0.5 * math.sqrt(3.0)  # largest distance, in units, of a point from its rounded one
 
 
-def encode_path(path: PredictedPath) -> bytes:
-    """Encode a predicted path."""
-    points = path.pos_ned_m.astype(_NUMBER)
-    header = _HEADER.pack(
+def encode_path(path: PredictedPath, *, compact: bool = False) -> bytes:
+    """Encode a predicted path.
+
+    Args:
+        path: to be encoded.
+        compact: whether points are rounded to fewer bytes, and the margin widened by the rounding. A path that bends
+            too much for its steps, or is too far away, is encoded as float32 all the same.
+    """
+    exponent = _exponent(path.pos_ned_m) if compact else None
+    if exponent is None:
+        return _header(path, FLOAT_VERSION, path.margin_m, 0) + path.pos_ned_m.astype(_NUMBER).tobytes()
+    units = np.rint(path.pos_ned_m * 2.0**-exponent)
+    steps = units[1:] - units[:-1]
+    bends = (steps[1:] - steps[:-1]).astype(_BEND)
+    begin = np.concatenate((units[0], steps[0])).astype(_BEGIN)
+    margin_m = min(MAX_MARGIN_M, path.margin_m + _ROUNDING_01 * 2.0**exponent)
+    points: bytes = begin.tobytes() + bends.tobytes()
+    return _header(path, COMPACT_VERSION, margin_m, exponent) + points
+
+
+def _header(path: PredictedPath, version: int, margin_m: float, exponent: int) -> bytes:
+    return _HEADER.pack(
         _MAGIC,
-        PATH_VERSION,
+        version,
         0,
         path.agent,
         path.boot_id,
         path.seq,
         path.t0_utc_us,
         path.dt_us,
-        path.margin_m,
-        len(points),
+        margin_m,
+        len(path.pos_ned_m),
         _HEADER.size,
+        exponent,
     )
-    return header + points.tobytes()
+
+
+def _exponent(pos_ned_m: Array) -> int | None:
+    """Return the exponent of the finest unit in which points (K, 3) can be compact; None if they can't be."""
+    if len(pos_ned_m) < 3:
+        return None
+    steps = pos_ned_m[1:] - pos_ned_m[:-1]
+    largest_m = float(np.abs(steps[1:] - steps[:-1]).max())
+    farthest_m = float(np.abs(pos_ned_m).max())
+    if not (largest_m <= _LARGEST_BEND * 2.0**_COARSEST and farthest_m < _FARTHEST_M):
+        return None
+    return next(e for e in range(_FINEST, _COARSEST + 1) if largest_m <= _LARGEST_BEND * 2.0**e)
 
 
 def decode_path(payload: bytes) -> PredictedPath | None:
     """Decode a path; None unless magic, version, lengths and all numbers are valid."""
     if len(payload) < _HEADER.size:
         return None
-    magic, version, _, agent, boot_id, seq, t0_utc_us, dt_us, margin_m, count, header_len = _HEADER.unpack_from(payload)
-    if magic != _MAGIC or version != PATH_VERSION or header_len < _HEADER.size:
+    (magic, version, _, agent, boot_id, seq, t0_utc_us, dt_us, margin_m, count, header_len, exponent) = (
+        _HEADER.unpack_from(payload)
+    )
+    if magic != _MAGIC or header_len < _HEADER.size or dt_us <= 0 or not 2 <= count <= MAX_POINTS:
         return None
-    if not 2 <= count <= MAX_POINTS or dt_us <= 0 or len(payload) != header_len + 12 * count:
+    if not (math.isfinite(margin_m) and 0.0 <= margin_m <= MAX_MARGIN_M):
         return None
-    numbers = np.frombuffer(payload, _NUMBER, 3 * count, header_len).astype(np.float64)
-    finite = math.isfinite(numbers @ numbers)  # squares of float32 can't overflow
-    if not (finite and math.isfinite(margin_m) and 0.0 <= margin_m <= MAX_MARGIN_M):
+    if version == FLOAT_VERSION:
+        pos_ned_m = _points(payload[header_len:], count)
+    elif version == COMPACT_VERSION:
+        pos_ned_m = _compact_points(payload[header_len:], count, exponent)
+    else:
+        return None
+    if pos_ned_m is None:
         return None
     return PredictedPath(
         agent=agent,
@@ -60,5 +107,26 @@ def decode_path(payload: bytes) -> PredictedPath | None:
         t0_utc_us=t0_utc_us,
         dt_us=dt_us,
         margin_m=margin_m,
-        pos_ned_m=numbers.reshape(count, 3),
+        pos_ned_m=pos_ned_m,
     )
+
+
+def _points(body: bytes, count: int) -> Array | None:
+    """Return points (count, 3) NED [m] from float32; None if there are more or fewer, or any is not finite."""
+    if len(body) != 3 * count * _NUMBER.itemsize:
+        return None
+    numbers = np.frombuffer(body, _NUMBER).astype(np.float64)
+    return numbers.reshape(count, 3) if math.isfinite(numbers @ numbers) else None  # squares can't overflow
+
+
+def _compact_points(body: bytes, count: int, exponent: int) -> Array | None:
+    """Return points (count, 3) NED [m] from the first one, the first step and bends; None if lengths don't fit."""
+    if count < 3 or len(body) != _BEGIN_BYTES + 3 * (count - 2) or not _FINEST <= exponent <= _COARSEST:
+        return None
+    units = np.empty((count, 3))
+    units[:2] = np.frombuffer(body, _BEGIN, 6).reshape(2, 3)
+    units[2:] = np.frombuffer(body, _BEND, offset=_BEGIN_BYTES).reshape(-1, 3)
+    np.cumsum(units[1:], axis=0, out=units[1:])  # whole numbers below 2^53, so that sums are exact
+    np.cumsum(units, axis=0, out=units)
+    units *= 2.0**exponent
+    return units

@@ -193,7 +193,8 @@ def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np
             margin_m=0.0,
             pos_ned_m=pos,
         )
-        yield utc_us, topics.PATH, agent_name(peer), encode_path(path)
+        encoded = encode_path(path, compact=config.agent.path_sharing.compact)
+        yield utc_us, topics.PATH, agent_name(peer), encoded
 
 
 def _straight_on(row: NDArray[np.void], at_us: NDArray[np.int64], brake_m_s2: float) -> Array:

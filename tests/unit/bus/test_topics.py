@@ -127,7 +127,7 @@ def test_a_number_that_is_not_finite_is_refused(number: int, bad: float) -> None
         encode_path(path())[:-1],
         encode_path(path()) + b"\x00",
         changed(0, "<B", ord("X")),
-        changed(2, "<B", 2),  # a version from the future
+        changed(2, "<B", 3),  # a version from the future
         changed(24, "<i", 0),  # dt
         changed(24, "<i", -20_000),
         changed(28, "<f", math.nan),  # radius

@@ -1,0 +1,157 @@
+"""Compact paths: bytes, how far points are rounded, what is encoded as float32 all the same, and what is refused."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarmctl.bus.messages.path_messages import (
+    COMPACT_VERSION,
+    FLOAT_VERSION,
+    MAX_POINTS,
+    decode_path,
+    encode_path,
+)
+from swarmctl.core.types import MAX_MARGIN_M, Array, PredictedPath
+from tests import builders
+
+STEP_S = 0.02
+UTC_US = 1_800_000_000_000_000
+COARSEST_M = 2.0**-10
+MARGIN_M = 0.1
+FLOAT32_M = 1e-7  # rounding of the margin
+
+
+def flown(accel_ned_m_s2: Array, vel_ned_m_s: Array, pos_ned_m: Array) -> Array:
+    """Points (K+2, 3) of a flight under accelerations (K, 3)."""
+    steps = np.cumsum(np.vstack([vel_ned_m_s * STEP_S, accel_ned_m_s2 * STEP_S**2]), axis=0)
+    return pos_ned_m + np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+
+
+def path(points: Array, margin_m: float = MARGIN_M) -> PredictedPath:
+    return builders.predicted_path(
+        agent=4, boot_id=7, seq=9, t0_utc_us=UTC_US, dt_us=20_000, margin_m=margin_m, pos_ned_m=points
+    )
+
+
+ANGLE = np.arange(41) * 0.02
+CIRCLE = np.column_stack([5.0 * np.cos(ANGLE), 5.0 * np.sin(ANGLE), -3.0 - 0.5 * ANGLE])  # 5 m/s
+EAST = np.outer(np.arange(41) * 0.1, [0.0, 1.0, 0.0])
+
+
+def version(points: Array) -> int:
+    return encode_path(path(points), compact=True)[2]
+
+
+def sent(points: Array, margin_m: float = MARGIN_M) -> PredictedPath:
+    """The path that receivers of a compact one have."""
+    payload = encode_path(path(points, margin_m), compact=True)
+    assert payload[2] == COMPACT_VERSION
+    decoded = decode_path(payload)
+    assert decoded is not None
+    return decoded
+
+
+def rounded_m(points: Array, decoded: PredictedPath) -> float:
+    return float(np.linalg.norm(decoded.pos_ned_m - points, axis=1).max())
+
+
+def test_forty_steps_take_less_than_two_hundred_bytes() -> None:
+    assert len(encode_path(path(CIRCLE), compact=True)) == 177
+    assert len(encode_path(path(CIRCLE))) == 528
+
+
+def test_all_but_points_and_margin_are_sent_as_they_are() -> None:
+    decoded = sent(CIRCLE)
+    assert (decoded.agent, decoded.boot_id, decoded.seq) == (4, 7, 9)
+    assert (decoded.t0_utc_us, decoded.dt_us) == (UTC_US, 20_000)
+    assert decoded.pos_ned_m.shape == CIRCLE.shape and decoded.pos_ned_m.dtype == np.float64
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-50.0, 50.0)] * 3), min_size=1, max_size=MAX_POINTS - 2),
+    st.tuples(*[st.floats(-20.0, 20.0)] * 3),
+    st.tuples(*[st.floats(-10_000.0, 10_000.0)] * 3),
+)
+def test_peers_keep_as_much_more_as_points_are_rounded(
+    accel: list[tuple[float, ...]], vel: tuple[float, ...], pos: tuple[float, ...]
+) -> None:
+    points = flown(np.array(accel), np.array(vel), np.array(pos))
+    decoded = sent(points)
+    assert MARGIN_M < decoded.margin_m < MARGIN_M + COARSEST_M
+    assert rounded_m(points, decoded) <= decoded.margin_m - MARGIN_M + FLOAT32_M
+
+
+def test_gentle_paths_are_rounded_less() -> None:
+    assert rounded_m(CIRCLE, sent(CIRCLE)) < 2.0**-14
+    assert rounded_m(EAST + 0.3 * 2.0**-16, sent(EAST)) < 2.0**-16
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("offset", [0.0, 0.25, 0.49, 0.51, 0.75])
+def test_the_sharpest_bend_that_is_compact_fits_wherever_its_points_lie(sign: float, offset: float) -> None:
+    bends = sign * 124.99 * COARSEST_M * (-1.0) ** np.arange(39)
+    points = flown(np.outer(bends / STEP_S**2, np.ones(3)), np.zeros(3), np.full(3, offset * COARSEST_M))
+    assert rounded_m(points, sent(points)) <= COARSEST_M
+
+
+def test_the_margin_stays_within_its_limit() -> None:
+    assert sent(CIRCLE, MAX_MARGIN_M).margin_m == MAX_MARGIN_M
+
+
+def bent(by_m: float) -> Array:
+    points = EAST.copy()
+    points[20:, 0] += by_m
+    return points
+
+
+@pytest.mark.parametrize(
+    "points",
+    [bent(126.0 * COARSEST_M), EAST + 2.0**14, EAST[:2], np.full((41, 3), np.nan)],
+    ids=["bends too much", "too far away", "two points", "not a number"],
+)
+def test_what_can_not_be_compact_is_sent_as_float32(points: Array) -> None:
+    assert encode_path(path(points), compact=True) == encode_path(path(points))
+    assert version(points) == FLOAT_VERSION
+
+
+@pytest.mark.parametrize("points", [bent(124.0 * COARSEST_M), EAST + 2.0**14 - 5.0, EAST[:3]])
+def test_what_is_just_within_the_limits_is_compact(points: Array) -> None:
+    assert version(points) == COMPACT_VERSION
+
+
+def changed(offset: int, code: str, value: int) -> bytes:
+    payload = bytearray(encode_path(path(CIRCLE), compact=True))
+    struct.pack_into(code, payload, offset, value)
+    return bytes(payload)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        encode_path(path(CIRCLE), compact=True)[:-1],
+        encode_path(path(CIRCLE), compact=True) + b"\x00",
+        changed(2, "<B", FLOAT_VERSION),
+        changed(2, "<B", COMPACT_VERSION + 1),
+        changed(32, "<B", 40),  # points
+        changed(32, "<B", 42),
+        changed(33, "<B", 35),  # header length
+        changed(34, "<b", -17),  # exponent
+        changed(34, "<b", -9),
+        changed(34, "<b", 127),
+        changed(32, "<B", 2)[: 36 + 24],
+    ],
+)
+def test_malformed_compact_paths_are_refused(payload: bytes) -> None:
+    assert decode_path(payload) is None
+
+
+@given(st.binary(min_size=24 + 117, max_size=24 + 117))
+def test_hostile_bodies_give_a_finite_path(body: bytes) -> None:
+    decoded = decode_path(encode_path(path(CIRCLE), compact=True)[:36] + body)
+    assert decoded is not None
+    assert np.isfinite(decoded.pos_ned_m).all()
