@@ -185,6 +185,7 @@ class Config(Params):
             obstacle_margin_m=self.limits.obstacle_margin_m,
             deadline_misses_01=self.limits.deadline_misses_01,
             solver_name=self.controller.mpc.qp.solver,
+            solver_retry=self.controller.mpc.qp.retry_solver,
             mode=mode,
             duration_s=self.mission.duration_s,
             downwash=self.separation.downwash,

@@ -78,7 +78,7 @@ class AutoFlight:
         self.reached: list[int] = []
         self.takeoff_alt_amsl_m: float | None = None
         self._takeoff_z_m: float | None = None
-        self._goal_ned_m: Ned | None = None  # target of DO_REPOSITION
+        self._goal_ned_m: Ned | None = None  # of DO_REPOSITION, or of a climb that LOITER goes on with
         self._return_z_m: float | None = None
         self._climb_xy_m: Xy | None = None
         self._climbed = False
@@ -87,10 +87,15 @@ class AutoFlight:
         self._jumps: dict[int, int] = {}
 
     def engage(self, mode: Px4Mode, estimate: Estimate, *, fresh: bool) -> None:
-        """Begin a mode at the vehicle's place; see `Navigator.engage` for `fresh`."""
+        """Begin a mode at the vehicle's place; see `Navigator.engage` for `fresh`.
+
+        LOITER keeps the goal of a return that is climbing, as PX4 does: it goes on to climb.
+        """
+        goal_ned_m = self._climb_goal() if mode == Px4Mode.AUTO_LOITER else None
         self.phase = Phase.CRUISE
         self.next_mode = None
-        self._takeoff_z_m = self._return_z_m = self._climb_xy_m = self._goal_ned_m = self._inside_us = None
+        self._takeoff_z_m = self._return_z_m = self._climb_xy_m = self._inside_us = None
+        self._goal_ned_m = goal_ned_m
         self._climbed = False
         self._navigator.engage(estimate, fresh=fresh)
         if mode == Px4Mode.AUTO_TAKEOFF and self.takeoff_alt_amsl_m is None:
@@ -185,6 +190,12 @@ class AutoFlight:
             return self._navigator.go_to(estimate, self._climb_xy_m, self._return_z_m, dt_s)
         self._climbed = True
         return self._navigator.go_to(estimate, home[:2], self._return_z_m, dt_s)
+
+    def _climb_goal(self) -> Ned | None:
+        """Return where a return climbs to; None unless it is climbing."""
+        if self._climb_xy_m is None or self._return_z_m is None or self._climbed or self.phase == Phase.LANDING:
+            return None
+        return *self._climb_xy_m, self._return_z_m
 
     def _return_height(self, away_m: float, home: Ned, z_m: float) -> float:
         """Return the height of PX4's cone: lower near home, no climb close above it; never below the vehicle."""

@@ -111,9 +111,10 @@ def test_twelve_agents_that_close_in_on_one_point_keep_their_distance(
 ) -> None:
     """With peers on both sides, room to stop beyond the horizon costs distance within it, and plans are refused.
 
-    Agents then coast on old plans and brake, each in another way.
+    Agents then coast on old plans and brake, each in another way. Of starts 0 to 5 those are three of six, and with
+    all attempts none: 0.871 to 0.891 m.
     """
     if rows != "as they are":
         monkeypatch.setattr(swarm_mpc, "_relaxed", lambda separation: iter(()))
-    flight = fly("swarm.agents=12", "sitl.start=air", until=lambda lockstep: mission_t_s(lockstep) >= 1.5)
+    flight = fly("swarm.agents=12", "sitl.start=air", until=lambda lockstep: mission_t_s(lockstep) >= 1.5, seed=2)
     assert (flight.separation_m() >= 0.85) is (rows == "as they are")

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
+from swarmctl.core.types import PlanStatus
 from tests.closed_loop.conftest import Flight, Fly, mission_is_over, mission_t_s
 
-SWAP = ("mission.duration_s=10.5", "sitl.start=air")  # all agents arrive within 10.4 s
+SWAP = ("mission.duration_s=12", "sitl.start=air")  # from ten starts all agents arrive within 9.5 to 11.7 s
 
 
 def all_arrived(lockstep: Lockstep) -> bool:
@@ -24,7 +25,10 @@ def check(flight: Flight) -> None:
     for agent in range(8):
         _, error = flight.tracked(agent)
         assert np.linalg.norm(error[-1]) < 0.1, "everybody arrives"
-        assert not flight.ticks(agent)["safety_filter_acted"].any(), "the safety filter is not what keeps them apart"
+        ticks = flight.ticks(agent)
+        assert not ticks["safety_filter_acted"].any(), "the safety filter is not what keeps them apart"
+        unsolved = np.isin(ticks["plan_status"], (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL))
+        assert not unsolved.any(), "what OSQP does not finish is solved all the same; by OSQP alone 12 to 22 are not"
 
 
 def test_eight_agents_swap_without_touching(fly: Fly) -> None:

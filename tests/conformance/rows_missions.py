@@ -252,6 +252,29 @@ RUN_ROWS = (
             sees("LOCAL_POSITION_NED", 15.0, x=near(8.0, 0.8), y=near(0.0, 0.8), z=near(-6.0, 1.6)),
         ),
     ),
+    Row(
+        name="HOLD while a return climbs goes on to climb",
+        section=RUN,
+        start=State.LOITER,
+        steps=(
+            Command(
+                number=REPOSITION,
+                params=(-1.0, 1.0, 0.0, NAN, float(LAT_E7 + NORTH_8_M), float(LON_E7), 495.4),
+                as_int=True,
+            ),
+            sees("LOCAL_POSITION_NED", 15.0, x=near(8.0, 0.8), y=near(0.0, 0.8)),
+            go(4, 5),
+            mode(M_RTL),
+            Wait(1.3),
+            go(4, 3),
+            mode(M_LOITER),
+            Mark(),
+            Moves("climb_m", Between(6.0, 24.0), 6.0),
+            heartbeat(custom_mode=M_LOITER),
+        ),
+        params={"RTL_RETURN_ALT": 30.0, "RTL_CONE_ANG": 0},
+        spoils=True,
+    ),
 )
 
 FENCE_ROWS = (

@@ -65,6 +65,7 @@ class Rules:
     obstacle_margin_m: float = 0.05  # allowed intrusion into keep_out_m
     deadline_misses_01: float = 0.2  # largest fraction of due ticks, flown or skipped, that may miss their deadline
     solver_name: str = "osqp"
+    solver_retry: str = "osqp"  # solves what that one does not finish
     mode: Literal["realtime", "lockstep"] = "realtime"
     duration_s: float | None = None  # mission time that a completed run must have tracked
     volume: FlightVolume | None = None  # that nobody may leave
@@ -129,7 +130,7 @@ def evaluate(
         "volume": volume,
         "timing": timing,
         "own_controllers": own_controllers(run.events),
-        "solver": solver_counts(run.ticks, rules.solver_name),
+        "solver": solver_counts(run.ticks, rules.solver_name, rules.solver_retry),
         "comms": communication(run.ticks, run.events, tracks.time_field),
         "deadlocks": deadlock_counts(run.events),
         "commitments": commitment_counts(run.events),

@@ -19,7 +19,7 @@ _CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
 _SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
 
 
-def solver_counts(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
+def solver_counts(ticks: Mapping[int, NDArray[np.void]], name: str, retry: str) -> dict[str, Any]:
     """Count solver failures while the agent had control, and find the largest residual of a plan that was flown."""
     flights = [flight_rows(rows) for rows in ticks.values()]
     charged = [rows[np.isin(rows["mode"], _CONTROLLED)] for rows in flights]
@@ -28,6 +28,7 @@ def solver_counts(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str,
     ]
     return {
         "name": name,
+        "retry": retry,
         "failed": sum(int(np.isin(rows["plan_status"], _SOLVER_FAILED).sum()) for rows in charged),
         "not_certified": sum(int((rows["plan_status"] == PlanStatus.NOT_CERTIFIED).sum()) for rows in charged),
         "max_residual_m": percentiles(residuals)["max"],

@@ -56,6 +56,7 @@ class _Solver(msgspec.Struct):
     not_certified: _Count
     max_residual_m: _Figure | None = None
     safety_filter_ticks: _Count = 0
+    retry: str = ""  # missing in older folders
 
 
 class _Comms(msgspec.Struct):

@@ -134,7 +134,8 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
         flown = f"{own['flown_ticks']} of {own['mission_ticks']}"
         yield SummaryRow(f"mission ticks flown by {own['name']}", flown, number=own["flown_ticks"])
     solver, comms = summary["solver"], summary["comms"]
-    yield SummaryRow(f"solver ({solver['name']}) failures", str(solver["failed"]))
+    solvers = " and ".join(dict.fromkeys(filter(None, (solver["name"], solver.get("retry")))))
+    yield SummaryRow(f"solver ({solvers}) failures", str(solver["failed"]))
     yield SummaryRow("plans refused by their certificate", str(solver["not_certified"]))
     if (deadlocks := summary.get("deadlocks") or {}).get("count"):
         yield SummaryRow("deadlocks, the longest", f"{deadlocks['count']}, {_figure(deadlocks['longest_s'], 's', 1)}")

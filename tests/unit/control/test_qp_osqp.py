@@ -1,7 +1,8 @@
-"""OSQP called without its Python class gives what that class gives, bit for bit."""
+"""OSQP without its Python class gives what that class gives, bit for bit; what it does not finish DAQP solves."""
 
 from __future__ import annotations
 
+import sys
 from itertools import pairwise
 
 import numpy as np
@@ -9,8 +10,10 @@ import osqp
 import pytest
 from scipy import sparse
 
+from swarmctl.config import load
 from swarmctl.control.mpc.solvers.qp import INFINITY, QpParams, pattern_index
 from swarmctl.control.mpc.solvers.qp_osqp import OsqpSolver
+from swarmctl.control.mpc.solvers.registry import make_solver
 from swarmctl.core.types import Array
 
 PARAMS = QpParams()
@@ -69,3 +72,29 @@ def test_a_series_of_problems_has_the_answers_of_the_python_class(seed: int) -> 
         assert (found.status, found.iterations) == (expected.info.status, expected.info.iter)
         answers.append(found.x)
     assert all((one != other).any() for one, other in pairwise(answers)), "each problem has its own answer"
+
+
+UNFINISHED = QpParams(eps=1e-9, eps_relative=1e-9, polish=False, max_iterations=10, check_every=1)
+
+
+def test_what_osqp_does_not_finish_is_solved_by_the_exact_solver() -> None:
+    problem = values(np.random.default_rng(1))
+    exact = make_solver(SQUARE, DENSE, QpParams(solver="daqp")).solve(*problem)
+    stopped = make_solver(SQUARE, DENSE, UNFINISHED.model_copy(update={"retry": "osqp"})).solve(*problem)
+    found = make_solver(SQUARE, DENSE, UNFINISHED).solve(*problem)
+    assert exact.x is not None and found.x is not None
+    assert found.exact and not stopped.exact
+    np.testing.assert_allclose(found.x, exact.x, atol=1e-12)
+
+
+def test_without_its_package_osqp_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert QpParams().retry_solver == QpParams(solver="daqp").retry_solver == "daqp"
+    monkeypatch.setitem(sys.modules, "daqp", None)
+    assert QpParams().retry_solver == "osqp"
+    solver = make_solver(SQUARE, DENSE, QpParams())
+    assert solver.solve(*values(np.random.default_rng(1))).exact
+
+
+def test_the_one_that_is_asked_is_named_in_the_summary() -> None:
+    assert load(None).rules().solver_retry == "daqp"
+    assert load(None, ["controller.mpc.qp.retry='osqp'"]).rules().solver_retry == "osqp"

@@ -377,6 +377,7 @@ def test_solver_failures_count_while_the_agent_has_control() -> None:
     ]
     assert solver == {
         "name": "daqp",
+        "retry": "osqp",
         "failed": 2,
         "not_certified": 1,
         "max_residual_m": pytest.approx(1e-4),

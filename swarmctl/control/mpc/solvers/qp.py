@@ -46,6 +46,13 @@ class QpParams(Params):
     rho: float = Field(0.01, gt=0, le=1e6)  # first step size of OSQP; adapted from then on
     adaptive_rho_interval: int = Field(50, ge=1, le=10000)  # iterations, never seconds
     check_every: int = Field(10, ge=1, le=1000)  # iterations between two looks at the residual
+    retry: Literal["auto", "osqp"] = "auto"  # auto: what OSQP does not finish DAQP solves, where it is installed
+
+    @property
+    def retry_solver(self) -> str:
+        """Return the name of the solver of what the first one does not finish."""
+        by_daqp = self.solver == "daqp" or (self.retry == "auto" and SOLVERS["daqp"]())
+        return "daqp" if by_daqp else "osqp"
 
     @field_validator("solver")
     @classmethod

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from osqp import ext_builtin as osqp
 from scipy import sparse
 
-from swarmctl.control.mpc.solvers.qp import NOT_FINITE, QpParams, QpSolution, is_finite
+from swarmctl.control.mpc.solvers.qp import NOT_FINITE, QpParams, QpSolution, QpSolver, is_finite
 from swarmctl.core.types import Array
 
 _RETRY_SCALINGS = 10  # scaling passes of a retry: they help problems that converge slowly, and no others
@@ -32,28 +32,38 @@ class OsqpSolver:
         p_pattern: (n, n) boolean, upper triangle used.
         a_pattern: (m, n) boolean.
         params: solver settings.
+        retry: solves what it does not finish; None: OSQP itself from scratch.
 
     `p_values` and `a_values` of `solve` are the entries of the patterns in column-major order; see `pattern_index`.
     """
 
-    def __init__(self, p_pattern: NDArray[np.bool_], a_pattern: NDArray[np.bool_], params: QpParams) -> None:
+    def __init__(
+        self,
+        p_pattern: NDArray[np.bool_],
+        a_pattern: NDArray[np.bool_],
+        params: QpParams,
+        retry: QpSolver | None = None,
+    ) -> None:
         self._p = sparse.csc_matrix(np.triu(p_pattern).astype(float))
         self._a = sparse.csc_matrix(a_pattern.astype(float))
-        self._params = params
+        self._params, self._retry = params, retry
         self._solver: osqp.OSQPSolver | None = None
 
     def solve(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
         if not is_finite(p_values, q, a_values, lower, upper):
             return NOT_FINITE
-        if self._solver is None:
-            return self._cold(p_values, q, a_values, lower, upper=upper, scaling=0)
-        self._solver.update_data_vec(q=q, l=lower, u=upper)
-        self._solver.update_data_mat(P_x=p_values, P_i=None, A_x=a_values, A_i=None)
-        solution = self._run()
-        if solution.exact:
+        if is_first := self._solver is None:
+            solution = self._cold(p_values, q, a_values, lower, upper=upper, scaling=0)
+        else:
+            self._solver.update_data_vec(q=q, l=lower, u=upper)
+            self._solver.update_data_mat(P_x=p_values, P_i=None, A_x=a_values, A_i=None)
+            solution = self._run()
+        if solution.exact or (is_first and self._retry is None):
             return solution
-        # a warm start can end in false infeasibility or slow convergence: retry from scratch
-        again = self._cold(p_values, q, a_values, lower, upper=upper, scaling=_RETRY_SCALINGS)
+        if self._retry is not None:
+            again = self._retry.solve(p_values, q, a_values, lower, upper)
+        else:  # a warm start can end in false infeasibility or slow convergence: retry from scratch
+            again = self._cold(p_values, q, a_values, lower, upper=upper, scaling=_RETRY_SCALINGS)
         return again if again.exact or solution.x is None else solution
 
     def _cold(

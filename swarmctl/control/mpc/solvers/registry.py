@@ -17,7 +17,12 @@ def _daqp(hessian: Mask, rows: Mask, params: QpParams) -> QpSolver:
     return DaqpSolver(hessian, rows, params)
 
 
-MAKERS = {"osqp": OsqpSolver, "daqp": _daqp}  # the same names as `qp.SOLVERS`
+def _osqp(hessian: Mask, rows: Mask, params: QpParams) -> QpSolver:
+    retry = _daqp(hessian, rows, params) if params.retry_solver == "daqp" else None
+    return OsqpSolver(hessian, rows, params, retry)
+
+
+MAKERS = {"osqp": _osqp, "daqp": _daqp}  # the same names as `qp.SOLVERS`
 
 
 def make_solver(p_pattern: Mask, a_pattern: Mask, params: QpParams) -> QpSolver:
