@@ -235,7 +235,7 @@ def test_a_fence_acts_as_told(fence: str, action: int, mode: Px4Mode) -> None:
         bench.pilot.parameters.assign("GF_MAX_HOR_DIST" if fence == "distance" else "GF_MAX_VER_DIST", 3.0)
     bench.run(0.3)
     assert not bench.pilot.failsafe  # inside: nothing
-    bench.world.plant.state[12 if fence == "height" else 11, 0] += -1.5 if fence == "height" else 5.0
+    bench.world.plant.state[12 if fence == "height" else 11, 0] += -1.5 if fence == "height" else 8.0
     bench.run(0.5)
     assert bench.pilot.failsafe == (action > 1)
     assert bench.pilot.mode == HOLD  # first time for the pilot
