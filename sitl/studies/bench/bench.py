@@ -121,7 +121,7 @@ def chosen_solvers(asked: Sequence[str]) -> tuple[list[str], str]:
         return list(dict.fromkeys(asked)), ""
     installed = installed_solvers()
     missing = [name for name in SOLVERS if name not in installed]
-    notes = [f"{name} is left out: it is not installed; in the checkout, pip install '.[{name}]'" for name in missing]
+    notes = [f"{name} is left out: it is not installed; pip install '{name}'" for name in missing]
     return list(installed), "; ".join(notes)
 
 

@@ -172,7 +172,7 @@ def test_an_unknown_solver_is_refused() -> None:
 
 def test_daqp_without_its_package_is_refused_with_the_config(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "daqp", None)
-    with pytest.raises(ConfigError, match=r"controller\.mpc\.qp\.solver = 'daqp'.*\.\[daqp\]"):
+    with pytest.raises(ConfigError, match=r"controller\.mpc\.qp\.solver = 'daqp'.*pip install 'daqp'"):
         load(None, ["controller.mpc.qp.solver='daqp'"])
     load(None)
 

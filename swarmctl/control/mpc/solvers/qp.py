@@ -31,14 +31,14 @@ SOLVERS = {"osqp": lambda: True, "daqp": _daqp_is_usable}  # by name: whether it
 
 
 def installed_solvers() -> tuple[str, ...]:
-    """Return the names of the QP solvers that can be imported: OSQP always, DAQP with the extra `swarmctl[daqp]`."""
+    """Return the names of the QP solvers that can be imported: OSQP always, DAQP unless it is missing."""
     return tuple(name for name, is_installed in SOLVERS.items() if is_installed())
 
 
 class QpParams(Params):
     """Sets the solver and its parameters: all apply to OSQP; DAQP is exact and takes `max_iterations` only."""
 
-    solver: Literal["osqp", "daqp"] = "osqp"  # daqp: faster on small swarms, needs the extra swarmctl[daqp]
+    solver: Literal["osqp", "daqp"] = "osqp"  # daqp: exact, and faster on small swarms
     eps: float = Field(3e-3, gt=0, le=0.1)  # absolute; variables and rows are scaled to about 1
     eps_relative: float = Field(3e-4, ge=0, le=0.1)  # small: bounds far from active must not loosen the others
     max_iterations: int = Field(2500, ge=10, le=100000)  # then the last iterate is judged by its residual
@@ -46,7 +46,7 @@ class QpParams(Params):
     rho: float = Field(0.01, gt=0, le=1e6)  # first step size of OSQP; adapted from then on
     adaptive_rho_interval: int = Field(50, ge=1, le=10000)  # iterations, never seconds
     check_every: int = Field(10, ge=1, le=1000)  # iterations between two looks at the residual
-    retry: Literal["auto", "osqp"] = "auto"  # auto: what OSQP does not finish DAQP solves, where it is installed
+    retry: Literal["auto", "osqp"] = "auto"  # auto: DAQP solves what OSQP does not finish, unless it is missing
 
     @property
     def retry_solver(self) -> str:
@@ -61,7 +61,7 @@ class QpParams(Params):
         if not SOLVERS[solver]():
             raise PydanticCustomError(
                 "missing_package",
-                "{solver} is not installed; in the checkout, pip install '.[{solver}]', or use solver = 'osqp'",
+                "{solver} is not installed; pip install '{solver}', or use solver = 'osqp'",
                 {"solver": solver},
             )
         return solver

@@ -1,6 +1,6 @@
 """Solver interface to DAQP: a dual active-set method, exact up to rounding, dense, fast for tens of variables.
 
-Imported only when a configuration asks for it (extra `swarmctl[daqp]`).
+Imported with the first solver: a system without a wheel of it flies with OSQP alone.
 """
 
 from __future__ import annotations
