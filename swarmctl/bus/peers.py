@@ -60,8 +60,7 @@ class PeerPaths:
         self._max_age_us = max_age_us
         self._max_lead_us = max_lead_us
         self._clocks = clocks
-        self._newest: dict[int, PredictedPath] = {}
-        self._sorted: tuple[PredictedPath, ...] = ()  # these, by agent number
+        self._newest: dict[int, PredictedPath] = {}  # in the order of agent numbers
         self.refusals = refusals
         self.heard_utc_us = 0
 
@@ -80,8 +79,9 @@ class PeerPaths:
         if self._verifiers[path.agent].accepts(
             ReceivedMessage(path.boot_id, path.seq, path.t0_utc_us, payload), utc_us
         ):
-            self._newest[path.agent], self.heard_utc_us = path, utc_us
-            self._sorted = tuple(self._newest[agent] for agent in sorted(self._newest))
+            is_first, self._newest[path.agent], self.heard_utc_us = path.agent not in self._newest, path, utc_us
+            if is_first:
+                self._newest = dict(sorted(self._newest.items()))
 
     def _by_own_clock(self, path: PredictedPath | None) -> PredictedPath | None:
         """Return the path at times of the own clock, with room for the error that is left of the peer's."""
@@ -97,7 +97,7 @@ class PeerPaths:
 
     def latest(self) -> tuple[PredictedPath, ...]:
         """Return the newest path of every peer, whatever its age, sorted by agent number."""
-        return self._sorted
+        return tuple(self._newest.values())
 
     def _refusal(self, sender: str, path: PredictedPath, utc_us: int) -> str:
         if sender != agent_name(path.agent):

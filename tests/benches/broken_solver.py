@@ -36,7 +36,7 @@ def break_solver(running: Lockstep, agent: int, lasts_s: float, spoil: Spoil = n
     assert flown is not None
     planner = flown._planner.controller
     assert isinstance(planner, SwarmMpc)
-    for solver in (planner._xy.session.solver, planner._xy_alone.session.solver):
+    for solver in (mpc.session.solver for mpc in (planner._xy_alone, *planner._xy.sizes.values())):
         solver.solve = partial(_solve, running, until_s, spoil, solver.solve)  # type: ignore[method-assign]
 
 

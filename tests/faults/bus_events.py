@@ -27,8 +27,8 @@ _HZ = 25  # ticks of a coarse scene
 
 def forget_stale(now: PeerPaths) -> tuple[PredictedPath, ...]:
     """Return the newest paths without those that are older than 0.2 s, as if who is silent had gone."""
-    newest = max((path.t0_utc_us for path in now._sorted), default=0)
-    return tuple(path for path in now._sorted if newest - path.t0_utc_us < 200_000)
+    newest = max((path.t0_utc_us for path in now._newest.values()), default=0)
+    return tuple(path for path in now._newest.values() if newest - path.t0_utc_us < 200_000)
 
 
 FORGETS = Off(patches=((PeerPaths, "latest", forget_stale),))

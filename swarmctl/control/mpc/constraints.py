@@ -16,7 +16,6 @@ from swarmctl.core.types import Array
 
 _SLACK_SCALE_M = 0.1  # unit of slack variables, so that they are about 1 like all others
 _REACHABLE_01 = 0.998  # share of the reachable displacement that replaces an end out of reach
-_ROW_SPACING_S = 0.08  # closer rows are nearly parallel, which slows a first-order solver down
 _FACE_SPACING_S = 0.2  # likewise; a path can't bend much in between
 _USUAL_S = 1.0  # time that braking takes, for the scale of its rows
 _ASKED_01 = 0.97  # share of the reachable displacement that a face may ask for: with 0.9 plans put braking off
@@ -150,17 +149,14 @@ class KeepOutHalfSpaces(ConstraintBlock):
     ) -> None:
         self._prediction, self._relax_01 = prediction, relax_01
         self._over, self._slope_floor = penalties.over, penalties.floor * _SLACK_SCALE_M * cost_scale
-        axes, horizon, first = prediction.axes, prediction.horizon, prediction.first_row()
-        stride = max(1, round(_ROW_SPACING_S / horizon.dt_s))
-        self.checked = np.arange(horizon.prediction - 1, first - 1, -stride)[::-1]  # 0-based steps that get rows
-        self._steps = np.append(self.checked, horizon.prediction - 1)  # those of the rows; the last one looks beyond
+        axes, self._steps = prediction.axes, prediction.row_steps
         step_m_s2 = max(a.du_max * a.gain_m_s2 for a in axes)
-        response = (prediction.pos_of_accel @ prediction.acted[0])[self.checked].max(axis=1) * step_m_s2
+        response = (prediction.pos_of_accel @ prediction.acted[0])[prediction.checked].max(axis=1) * step_m_s2
         response = np.append(response, response[-1])  # the stopping row
         self._row_scale = 1.0 / np.maximum(response, 0.01)  # rows of about unit size suit a first-order solver
         self._scale = np.tile(self._row_scale, max_keep_outs)  # of all rows
         self._unit = (prediction.du_max[:, None] * self._row_scale)[:, None, :, None]  # (axes, 1, checks, 1)
-        uses = np.ones((max_keep_outs * len(response), len(axes) * horizon.control), bool)
+        uses = np.ones((max_keep_outs * len(response), len(axes) * prediction.horizon.control), bool)
         slacks = np.kron(np.eye(max_keep_outs), (_SLACK_SCALE_M * self._row_scale)[:, None])
         curvature = 2 * penalties.slack_quadratic * _SLACK_SCALE_M**2 * cost_scale
         super().__init__(uses, slacks, curvature)

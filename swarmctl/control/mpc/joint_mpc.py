@@ -20,6 +20,7 @@ from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces, Pen
 from swarmctl.control.mpc.condensed import CondensedMpc
 from swarmctl.control.mpc.judgement import judged
 from swarmctl.control.mpc.problem import Problem
+from swarmctl.control.mpc.sized_mpc import SizedMpc
 from swarmctl.control.mpc.swarm_mpc import MpcParams, faces_along, first_guess, near_half_spaces, planned
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
@@ -55,16 +56,20 @@ class JointMpc:
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self.longest = params.horizon_xy
         eps, eps_relative = _TOLERANCE_01 * params.qp.eps, _TOLERANCE_01 * params.qp.eps_relative
-        self._mpc = CondensedMpc(
-            (*params.horizontal(vehicle), params.vertical()),
-            params.horizon(params.control_xy, params.horizon_xy, vehicle),
-            max_keep_outs,
-            separation.relax_01,
-            penalties=Penalties(),
-            qp=params.qp.model_copy(update={"eps": eps, "eps_relative": eps_relative}),
-            stopwatch_ns=stopwatch_ns,
-            faces=faces_along(volume, slice(0, 3)),
-        )
+
+        def joint(room: int) -> CondensedMpc:
+            return CondensedMpc(
+                (*params.horizontal(vehicle), params.vertical()),
+                params.horizon(params.control_xy, params.horizon_xy, vehicle),
+                room,
+                separation.relax_01,
+                penalties=Penalties(),
+                qp=params.qp.model_copy(update={"eps": eps, "eps_relative": eps_relative}),
+                stopwatch_ns=stopwatch_ns,
+                faces=faces_along(volume, slice(0, 3)),
+            )
+
+        self._mpc = SizedMpc(joint, max_keep_outs)
 
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""

@@ -16,6 +16,7 @@ from swarmctl.control.mpc.axes import AxesProblem, Axis, HalfSpaces, Horizon
 from swarmctl.core.types import Array
 
 _DECIDED_S = 0.12  # motion within this time after the dead time can hardly be changed
+_ROW_SPACING_S = 0.08  # closer rows are nearly parallel, which slows a first-order solver down
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +79,9 @@ class Prediction:
         self._has_lag = any(a.lag is not None for a in axes)
         self._lags = [lag_response(a.lag, horizon.dt_s, horizon.prediction) for a in axes]
         self.acted = np.stack([lag.of_command @ self.hold for lag in self._lags])  # (axes, Hp, Hc) realised inputs
+        first, stride = self.first_row(), max(1, round(_ROW_SPACING_S / horizon.dt_s))
+        self.checked = np.arange(horizon.prediction - 1, first - 1, -stride)[::-1]  # 0-based steps that get rows
+        self.row_steps = np.append(self.checked, horizon.prediction - 1)  # those of the rows; the last looks beyond
 
     def columns(self, axis: int) -> slice:
         """Return the variables that are the increments of an axis."""

@@ -23,6 +23,7 @@ from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Faces, Ha
 from swarmctl.control.mpc.condensed import CondensedMpc
 from swarmctl.control.mpc.judgement import judged
 from swarmctl.control.mpc.problem import Problem
+from swarmctl.control.mpc.sized_mpc import SizedMpc
 from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
@@ -146,8 +147,9 @@ class SwarmMpc:
             stopwatch_ns=stopwatch_ns,
             faces=faces_along(volume, slice(2, 3)),
         )
-        self._xy, self._xy_alone = (  # without keep-outs the problem is small and solved exactly
-            CondensedMpc(
+
+        def across(room: int) -> CondensedMpc:
+            return CondensedMpc(
                 params.horizontal(vehicle),
                 params.horizon(params.control_xy, params.horizon_xy, vehicle),
                 room,
@@ -157,8 +159,9 @@ class SwarmMpc:
                 stopwatch_ns=stopwatch_ns,
                 faces=faces_along(volume, slice(0, 2)),
             )
-            for room in (max_keep_outs, 0)
-        )
+
+        self._xy = SizedMpc(across, max_keep_outs)
+        self._xy_alone = across(0)  # without keep-outs the problem is small and solved exactly
         self._first_row = self._xy.prediction.first_row()
         following = np.minimum(np.arange(self.steps), params.horizon_z - 1)
         self._thrust_of = following if params.thrust_ahead == "planned" else 0 * following  # (steps,) of the z plan

@@ -132,7 +132,7 @@ def test_the_residual_of_half_spaces_is_the_depth_in_metres(seed: int) -> None:
     block = KeepOutHalfSpaces(ahead, 2, 1.0, Penalties(), cost_scale=1.0)
     step = forecast(ahead, spaces(0.05))
     pos, vel = flown(ahead, step, moves)
-    along = np.append((pos @ (-np.sqrt(0.5) * np.ones(2)))[block.checked], 0.0)
+    along = np.append((pos @ (-np.sqrt(0.5) * np.ones(2)))[ahead.checked], 0.0)
     along[-1] = (pos[-1] + 0.3 * vel[-1]) @ (-np.sqrt(0.5) * np.ones(2))
     depth_m = float((0.05 - along).max())
     program = Program(TrackingCost(ahead).pattern(), (block,))

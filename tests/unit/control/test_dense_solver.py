@@ -129,13 +129,13 @@ def test_half_spaces_against_a_dense_solver(
         ref_vel_m_s=np.zeros((25, 2)),
     )
     ours = problem.solve(tick, spaces)
-    u, p, _ = dense(problem, pos, vel, u_prev, gain, ref, spaces, problem.half_spaces.checked)
+    u, p, _ = dense(problem, pos, vel, u_prev, gain, ref, spaces, problem.prediction.checked)
     np.testing.assert_allclose(ours.pos_m, p, atol=5e-4)
     np.testing.assert_allclose(ours.u, u, atol=3e-3)
     assert ours.slack_m < 1e-3
     assert ours.residual_m < 1e-3
     unit = spaces.normal[0, 0]
-    assert ((ours.pos_m @ unit)[problem.half_spaces.checked] >= offset_m - 1e-3).all()
+    assert ((ours.pos_m @ unit)[problem.prediction.checked] >= offset_m - 1e-3).all()
     assert unit @ (ours.pos_m[-1] + stop_s * ours.vel_m_s[-1]) >= offset_m - 1e-3
     free = problem.solve(tick)
     active = bool(np.abs(free.pos_m - ours.pos_m).max() > 0.005)
@@ -144,9 +144,9 @@ def test_half_spaces_against_a_dense_solver(
 
 def test_rows_are_at_the_end_of_the_horizon_and_none_before_it_can_be_influenced() -> None:
     problem = mpc(AXIS, AXIS, max_keep_outs=1)
-    assert problem.half_spaces.checked[-1] == 39
-    assert problem.half_spaces.checked[0] >= 6
-    assert np.diff(problem.half_spaces.checked).max() * HORIZON.dt_s <= 0.081  # between samples the certificate looks
+    assert problem.prediction.checked[-1] == 39
+    assert problem.prediction.checked[0] >= 6
+    assert np.diff(problem.prediction.checked).max() * HORIZON.dt_s <= 0.081  # between samples the certificate looks
 
 
 def test_rows_that_cannot_be_met_give_slack_and_not_failure() -> None:
@@ -186,4 +186,4 @@ def test_relaxed_rows_ask_for_no_more_than_can_be_reached() -> None:
     assert solution.slack_m < 0.02
     reach, _ = simulate(0.0, 0.0, np.clip(-0.05 * np.arange(1, 41), -0.2, None), GAIN, 0.0, 0.02, False)
     assert solution.pos_m[-1, 0] >= 0.9 * reach[-1] - 0.02
-    assert (solution.pos_m[problem.half_spaces.checked, 0] >= 0.9 * reach[problem.half_spaces.checked] - 0.02).all()
+    assert (solution.pos_m[problem.prediction.checked, 0] >= 0.9 * reach[problem.prediction.checked] - 0.02).all()
