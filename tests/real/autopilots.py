@@ -50,6 +50,7 @@ class Kind:
         command: binary and start to command line.
         environment: what it is told by environment variables.
         lock_name: of a file in `TMP` by which it runs once on a machine, whatever the network; {} is the instance.
+        programs: names of programs that its start needs beside its binary.
     """
 
     variable: str
@@ -59,12 +60,20 @@ class Kind:
     command: Callable[[Path, Start], list[str]]
     environment: Callable[[Start], dict[str, str]] = field(default=lambda start: {})
     lock_name: str = ""
+    programs: tuple[str, ...] = ()
 
     @property
     def binary(self) -> Path | None:
         """Return the build to test with, or None."""
         given = os.environ.get(self.variable, "")
         return Path(given).expanduser().absolute() if given else None
+
+    @property
+    def unusable(self) -> list[str]:
+        """Return what a named build lacks: files that don't exist, or are no programs (as copies of links are)."""
+        assert self.binary is not None
+        needed = (self.binary, *(self.binary.parent / name for name in self.programs))
+        return [str(file) for file in needed if not (file.is_file() and os.access(file, os.X_OK))]
 
     def has_own_tmp(self, network: Network) -> bool:
         """Return whether its locks are its own: where that is permitted, and its build is still seen then."""
@@ -150,6 +159,7 @@ PX4 = Kind(
     command=_px4_command,
     environment=_px4_environment,
     lock_name="px4_lock-{}",
+    programs=("px4-param",),
 )
 ARDUCOPTER = Kind(
     variable="SWARMCTL_ARDUCOPTER",

@@ -91,7 +91,7 @@ def require(kind: Kind, network: Network, count: int) -> None:
     """Skip without a build; fail where a named build does not exist."""
     if kind.binary is None:
         pytest.skip(f"{kind.variable} names no build")
-    assert kind.binary.is_file(), f"{kind.variable}: {kind.binary} is no file"
+    assert not kind.unusable, f"{kind.variable}: {', '.join(kind.unusable)} can't be run; see docs/real_autopilots.md"
     taken = network.taken(port + kind.spread * i for port in kind.ports for i in range(count))
     if taken:
         pytest.skip(f"ports {taken} are taken; run as root for a network of its own")
