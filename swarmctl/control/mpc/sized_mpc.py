@@ -1,9 +1,8 @@
 """One condensed MPC for each of several numbers of keep-outs, of which the smallest with room is solved.
 
 Of many keep-outs only those have rows that bounded increments can violate: the others change no solution, and the time
-of a solution grows faster than the number of its rows. Of a few all have rows: a first-order solver that is asked for a
-hundredth starts from its last answer, and where rows came and went, four agents that swap places came to 0.81 m of each
-other in place of 0.87 m.
+of a solution grows faster than the number of its rows. Of a few all have rows, which take little time: a first-order
+solver starts from its last answer, and a program whose rows come and go has an older one to start from.
 """
 
 from __future__ import annotations
