@@ -79,7 +79,8 @@ class PeerPaths:
         if self._verifiers[path.agent].accepts(
             ReceivedMessage(path.boot_id, path.seq, path.t0_utc_us, payload), utc_us
         ):
-            is_first, self._newest[path.agent], self.heard_utc_us = path.agent not in self._newest, path, utc_us
+            is_first = path.agent not in self._newest
+            self._newest[path.agent], self.heard_utc_us = path, utc_us
             if is_first:
                 self._newest = dict(sorted(self._newest.items()))
 

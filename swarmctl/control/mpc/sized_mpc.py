@@ -72,7 +72,7 @@ def within_reach(spaces: HalfSpaces, prediction: Prediction, forecast: Forecast)
     moved[:, :, -1] += stop_s * (forecast.response[1, :, None, -1] @ extremes)[:, None, :, 0, 0]
     moved *= normal
     least_m = np.add.reduce(np.minimum(moved[0], moved[1]), axis=2)
-    kept = (asked_m > least_m).any(axis=1).nonzero()[0]
+    kept = (~(asked_m <= least_m)).any(axis=1).nonzero()[0]  # with numbers that are none, which the solver refuses
     return HalfSpaces(
         normal=spaces.normal[kept],
         offset_m=spaces.offset_m[kept],

@@ -109,6 +109,14 @@ def test_plans_are_the_same_with_rows_of_all_keep_outs(seed: int) -> None:
     np.testing.assert_allclose(ours.pos_m, theirs.pos_m, atol=1e-3)
 
 
+def test_a_number_that_is_none_is_not_taken_for_out_of_reach() -> None:
+    rng = np.random.default_rng(19)
+    problem = asked(rng)
+    spaces, whole = families(rng, problem.pos_m), sized()
+    spaces.offset_m[3] = np.nan
+    assert not whole.solve(problem, spaces).solved
+
+
 def test_rooms_double_up_to_the_most() -> None:
     assert [rooms(most) for most in (0, 3, 16, 17, 30, 100)] == [
         [0],
