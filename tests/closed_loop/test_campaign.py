@@ -59,6 +59,7 @@ def test_negative_control_agents_that_see_nobody_do(quick: Path) -> None:
     assert all(row["min_separation_m"] < TOUCH_M[row["scenario"]] for row in rows)
 
 
+@pytest.mark.usefixtures("configured_starts")
 def test_the_same_seed_gives_the_same_row_and_another_one_does_not(quick: Path) -> None:
     flown, other = (row for row in rows_in(quick) if row["protections"] == "off")
     assert trial_of(flown).cell == trial_of(other).cell

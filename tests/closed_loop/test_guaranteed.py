@@ -9,11 +9,12 @@ import pytest
 
 from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight
-from sitl.studies.campaign.trials import Cell, Trial
+from sitl.studies.campaign.trials import Cell, Row, Trial
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.core.clock import ClockError
 from tests.benches.guaranteed_trials import COMMITTED_M, TOUCH_M, events, flown
+from tests.closed_loop.conftest import from_some_start, nudged
 
 
 def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
@@ -26,30 +27,40 @@ def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
     assert events(flight, "tracking_violation") == []
 
 
-@pytest.mark.parametrize(
-    ("traffic_rule", "bound_m"),
-    [
-        ("", COMMITTED_M),
-        ("agent.commit.right_of_way_rad=0.35 agent.commit.stuck_m=0.1", COMMITTED_M - 0.03),
-    ],
-    ids=["right of way early", "control: only after standing"],
-)
-def test_agents_that_meet_give_way_by_rule_before_all_stand(traffic_rule: str, bound_m: float) -> None:
-    """Late plans that end in stops lock in the middle of a swap, and to get out of that takes as long again."""
-    row = flown(
-        Cell(
-            scenario="swap",
-            agents=6,
-            delay_ms=100.0,
-            loss=0.0,
-            noise="exact",
-            wind_m_s=0.0,
-            protections="guaranteed",
-            sets=traffic_rule,
-        )
-    ).row(None)
-    assert row["min_separation_m"] >= bound_m
-    assert (row["flight_time_s"] < 11.0) is (traffic_rule == "")
+PROMPT_S = 11.0  # for agents that lock in the middle of their swap it takes as long again
+
+
+def swap_of_six(traffic_rule: str = "", start: int = 0) -> Row:
+    """Fly a swap whose plans are late; `start` is a seed of `nudged`."""
+    cell = Cell(
+        scenario="swap",
+        agents=6,
+        delay_ms=100.0,
+        loss=0.0,
+        noise="exact",
+        wind_m_s=0.0,
+        protections="guaranteed",
+        sets=traffic_rule,
+    )
+    layout = layout_of("swap", 1, 6)
+    flight = TrialFlight(Trial(cell, 1), replace(layout, starts_ned_m=nudged(layout.starts_ned_m, start)))
+    flight.run()
+    return flight.row(None)
+
+
+def test_agents_that_meet_give_way_by_rule_before_all_stand() -> None:
+    row = swap_of_six()
+    assert row["min_separation_m"] >= COMMITTED_M
+    assert row["flight_time_s"] < PROMPT_S
+
+
+def test_negative_control_agents_that_give_way_only_after_standing_lock() -> None:
+    def locks(start: int) -> bool:
+        row = swap_of_six("agent.commit.right_of_way_rad=0.35 agent.commit.stuck_m=0.1", start)
+        assert row["min_separation_m"] >= COMMITTED_M - 0.03
+        return bool(row["flight_time_s"] >= PROMPT_S)
+
+    assert from_some_start(locks)
 
 
 def test_agents_fly_around_where_a_lost_peer_was_committed_to_end() -> None:

@@ -30,6 +30,8 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Plan, PlanStatus
 
+_SLACK_M = 0.02  # what a plan may come closer than asked before another is made: four swap at 0.80 m without it, 0.89
+
 
 class AxisWeights(Params):
     """Sets the quadratic weights of one axis."""
@@ -296,7 +298,9 @@ def planned(
     separation: SeparationParams,
     stopwatch_ns: Callable[[], int],
 ) -> Plan:
-    """Plan within the half-spaces near the guess and, as long as the plan is not certified, within others.
+    """Plan within the half-spaces near the guess and, until a plan keeps the distances asked, within others.
+
+    Returns the plan that lacks least of those distances; one that is not flown only where all are such.
 
     Args:
         spaces_of: returns half-spaces for given parameters.
@@ -306,18 +310,30 @@ def planned(
     """
     began_ns = stopwatch_ns()
     spaces = spaces_of(separation)
-    found = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
+    best = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
     for relaxed in _relaxed(separation):
-        if spaces is None or found.status is not PlanStatus.NOT_CERTIFIED:
-            return found
+        if spaces is None or not _lacks_distance(best):
+            return best
         began_ns, before, spaces = stopwatch_ns(), spaces, spaces_of(relaxed)
         if spaces is not None and not _are_equal(spaces, before):
-            found = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
+            best = _better(best, plan(spaces, (stopwatch_ns() - began_ns) * 1e-3))
+    return best
+
+
+def _lacks_distance(plan: Plan) -> bool:
+    """Return whether a plan comes closer than asked, by more than `_SLACK_M` or than is ever flown."""
+    return plan.slack_m > _SLACK_M if plan.status is PlanStatus.OK else plan.status is PlanStatus.NOT_CERTIFIED
+
+
+def _better(best: Plan, found: Plan) -> Plan:
+    """Return the plan with less slack of two that may be flown, else the one that may, else the one found last."""
+    if best.status is PlanStatus.OK:
+        return found if found.status is PlanStatus.OK and found.slack_m < best.slack_m else best
     return found
 
 
 def _relaxed(separation: SeparationParams) -> Iterator[SeparationParams]:
-    """Yield parameters of half-spaces for a plan that is not certified within those of `separation`.
+    """Yield parameters of half-spaces for a plan that lacks distance within those of `separation`.
 
     - Without the gate: a plan may move far away from a guess that stands still, while half-spaces far from the guess
       are left out. It then runs into peers that are there by the time it arrives, as does the next from that guess.
