@@ -34,11 +34,11 @@ def over(lockstep: Lockstep) -> bool:
     return lockstep.finished or lockstep.clock.now_us() > 30e6
 
 
-@pytest.mark.parametrize(("seed", "above_m"), [(0, 1.5), (3, 1.1)])
-def test_agents_missing_nine_of_ten_deadlines_come_to_rest_far_apart_and_land(seed: int, above_m: float) -> None:
-    """The worst of six starts, five of them shifted by a millimetre, is that of seed 3: 1.16 m."""
+@pytest.mark.parametrize("seed", [0, 3])
+def test_agents_missing_nine_of_ten_deadlines_come_to_rest_far_apart_and_land(seed: int) -> None:
+    """The worst of ten starts, nine of them shifted by a millimetre, is that of seed 3: 1.12 m."""
     flight = swapped(until=over, at={0.5: one_tick_of(10)}, seed=seed)
-    assert flight.separation_m() > above_m
+    assert flight.separation_m() > 1.1
     assert {agent.outcome.split(":")[0] for agent in flight.lockstep.agents if agent} == {"overload"}
     levels = [e["level"] for e in flight.lockstep.logs[0].events if e["event"] == "overload"]
     assert levels == ["WIDEN", "HOLD", "LAND"]
