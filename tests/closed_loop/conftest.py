@@ -100,7 +100,6 @@ class Flight:
 
 
 Fly = Callable[..., Flight]
-STARTS = range(6)  # seeds of `nudged`
 
 
 def nudged(starts_ned_m: Array, seed: int) -> Array:
@@ -109,14 +108,6 @@ def nudged(starts_ned_m: Array, seed: int) -> Array:
     if seed:
         offsets[:, :2] = np.random.default_rng(seed).uniform(-_NUDGE_M, _NUDGE_M, (len(starts_ned_m), 2))
     return starts_ned_m + offsets
-
-
-def from_some_start(fails: Callable[[int], bool]) -> bool:
-    """Return whether a flight without its protection fails from any of six starts; a rounding decides from which.
-
-    `fails` returns whether the flight does whose starts are shifted by a given seed of `nudged`.
-    """
-    return any(map(fails, STARTS))
 
 
 def fly_now(
@@ -188,7 +179,11 @@ def nudged_starts(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture
 def configured_starts(nudged_starts: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Start as configured all the same: for flights that are compared with those of other processes."""
+    """Start as configured all the same.
+
+    That is for flights compared with those of other processes, and for controls that fail from some starts only: a
+    claim has to hold from all of them, its control has to fail from one.
+    """
     monkeypatch.setattr(Config, "simulator", _as_configured)
 
 

@@ -206,7 +206,7 @@ def test_commands_with_old_or_future_stamps_are_refused_and_the_last_one_counts(
         assert agent._publisher.active_alert.text == "command of operator refused: future_order"
         speeds_m_s.append(float(np.linalg.norm(running.logs[0].rows[-1]["vel_ned_m_s"][0])))
 
-    flight = swap(fly, at={1.0: orders, 2.5: look})
+    flight = swap(fly, at={1.0: orders, 2.5: look}, until_s=2.6)  # before they meet
     assert speeds_m_s[0] > 0.3
     assert Mode.HOLD not in flight.modes(0, Phase.TRACK)
     assert not (flight.ticks(0)["phase"] > Phase.TRACK).any()

@@ -125,6 +125,7 @@ def test_nobody_leaves_a_commitment_before_peers_that_are_merely_cut_off() -> No
     assert all(e["excluded"] == [4, 5] for e in excluded)
 
 
+@pytest.mark.usefixtures("configured_starts")
 def test_negative_control_agents_that_doubt_silent_peers_evade(monkeypatch: pytest.MonkeyPatch) -> None:
     relied_on = Coordination._relied_on
 

@@ -19,7 +19,7 @@ from swarmctl.control.commit.tube import Tube
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Phase
 from swarmctl.simulator_config import FaultParams
-from tests.closed_loop.conftest import ROOT, from_some_start, nudged
+from tests.closed_loop.conftest import ROOT
 
 X500 = ROOT / "configs" / "x500_circle.toml"
 
@@ -49,11 +49,11 @@ def test_a_sudden_wind_blows_a_hovering_vehicle_no_farther_than_distances_leave_
     assert 0.8 * config.drift_m < drifted_m <= config.drift_m
 
 
-def blown_farther_than_expected(start: int = 0) -> CollisionMonitor:
+def blown_farther_than_expected() -> CollisionMonitor:
     """Six vehicles swap with room for gusts of 4 m/s; each is hit by a wind of 8 m/s of its own in the first 4 s.
 
     That is more than is guaranteed: what is shown is that the reaction makes the difference in one flight, not in all.
-    `start` is a seed of `nudged`.
+    From fifteen starts shifted by millimetres two touch with the reaction and four without it; means 1.20 and 0.97 m.
     """
     cell = Cell(
         scenario="swap",
@@ -67,17 +67,17 @@ def blown_farther_than_expected(start: int = 0) -> CollisionMonitor:
         disturbance="steps:8",
         sets="separation.gust_m_s=4",
     )
-    layout = drawn(cell, 1)
-    starts = nudged(layout.starts_ned_m, start)
-    flight = TrialFlight(Trial(cell, 1), replace(layout, starts_ned_m=starts, limit_s=8.0))
+    flight = TrialFlight(Trial(cell, 1), replace(drawn(cell, 1), limit_s=8.0))
     flight.run()
     return flight.monitor
 
 
+@pytest.mark.usefixtures("configured_starts")
 def test_vehicles_that_are_blown_out_of_their_tubes_commit_anew_and_keep_apart() -> None:
     assert blown_farther_than_expected().min_separation_m >= 0.85
 
 
+@pytest.mark.usefixtures("configured_starts")
 def test_negative_control_vehicles_that_chase_what_they_were_committed_to_touch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -86,4 +86,4 @@ def test_negative_control_vehicles_that_chase_what_they_were_committed_to_touch(
     monkeypatch.setattr(PeerClocks, "spread_us", lambda self, agent: 0)
     monkeypatch.setattr(Tube, "update", lambda self, *_: False)
     monkeypatch.setattr(Commitments, "wait_for", lambda self, *_: None)
-    assert from_some_start(lambda start: blown_farther_than_expected(start).collided)
+    assert blown_farther_than_expected().collided

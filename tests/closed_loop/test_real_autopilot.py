@@ -161,6 +161,7 @@ def test_three_vehicles_keep_their_assigned_places_around_the_reference() -> Non
     assert true_m >= 0.88
 
 
+@pytest.mark.usefixtures("configured_starts")
 def test_three_vehicles_without_assigned_places_push_each_other_around_it() -> None:
     flight = fly(*IN_A_ROW, "mission.duration_s=12")
     assert wandered_m(flight) > 0.12
