@@ -44,6 +44,7 @@ def test_agents_missing_nine_of_ten_deadlines_come_to_rest_far_apart_and_land(se
     assert levels == ["WIDEN", "HOLD", "LAND"]
 
 
+@pytest.mark.usefixtures("configured_starts")
 @pytest.mark.parametrize(("seed", "below_m"), [(0, BODY_M), (1, 0.8)])
 def test_negative_control_without_the_reaction_they_come_too_close(seed: int, below_m: float) -> None:
     """Bodies touch from the start as configured; the worst of five shifted ones is that of seed 1: 0.75 m."""
