@@ -13,6 +13,7 @@ from typing import Any
 from swarmctl.agent.components import (
     make_controllers,
     make_estimator,
+    make_interest,
     make_reference_selector,
     make_safety_filter,
     make_separation_policy,
@@ -113,6 +114,7 @@ class Agent:
         self._path_publisher = PathPublisher(
             setup, ports, controller, own_state.delay_us, widens_in_gusts=not self._separation.uses_commitments
         )
+        self._interest = make_interest(setup, ports, self._world_model, controller)
 
     @property
     def done(self) -> bool:
@@ -293,6 +295,7 @@ class Agent:
             margins_m=(frame_margin_m, self._deadlines.margin_m, self._planner.directive.margin_m),
         )
         self._separation.publish(self._ports.clock.utc_us())
+        self._interest.update(state, self._ports.clock.utc_us())
 
     def _advance(self, now_us: int, state: VehicleState | None) -> None:
         """Advance the mission, and request from the autopilot what its phase needs."""

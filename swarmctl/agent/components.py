@@ -13,6 +13,7 @@ from swarmctl.agent.planning.separation_policy import BestEffort, Guaranteed, Se
 from swarmctl.agent.ports import Ports
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.setup import AgentSetup
+from swarmctl.agent.sharing.interest import Interest
 from swarmctl.agent.sharing.telemetry_publisher import TelemetryPublisher
 from swarmctl.control.commit.trajectory_planner import following
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
@@ -136,6 +137,18 @@ def make_safety_filter(setup: AgentSetup, ports: Ports, world_model: WorldModel)
         downwash=setup.separation.downwash,
         note=ports.note,
         stopwatch_ns=ports.stopwatch_ns,
+    )
+
+
+def make_interest(setup: AgentSetup, ports: Ports, world_model: WorldModel, controller: Controller) -> Interest:
+    """Return what chooses the peers whose every path is heard."""
+    return Interest(
+        setup.params.path_sharing,
+        setup.separation,
+        ports.bus,
+        world_model.paths,
+        setup.peers,
+        horizon_s=controller.steps * controller.dt_us * 1e-6,
     )
 
 

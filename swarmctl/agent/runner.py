@@ -200,6 +200,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
     launcher = (topics.OPERATOR,)
     listen = {
         topics.PATH: peers,
+        topics.FAR_PATH: peers if config.agent.path_sharing.far_hz else [],
         topics.STATUS: peers,
         topics.TRAJECTORY: peers,
         topics.RELAY: peers,

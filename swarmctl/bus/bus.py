@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Protocol
 
 from swarmctl.bus.refusals import RefusedMessage
@@ -27,6 +27,9 @@ class Bus(Protocol):
 
         There is at most one ring of each sender, and `TOO_LONG` replaces a message that is too long for its topic.
         """
+
+    def hear(self, topic: Topic, senders: Collection[str]) -> None:
+        """Receive a topic from these senders from now on, and from nobody else."""
 
     def refused(self) -> list[RefusedMessage]:
         """Return the messages that were not delivered since the last call; only sealed ones are refused by a bus."""

@@ -9,7 +9,7 @@ The layout is little-endian: a header, then for each message the number of its a
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.refusals import RefusedMessage
@@ -100,6 +100,10 @@ class RelayingBus(Bus):
             names = [(self._names[agent], carried) for agent, carried in messages if agent in self._names]
             found += [item for item in names if self._newest.get(item[0]) != item[1] and item not in found]
         return found
+
+    def hear(self, topic: Topic, senders: Collection[str]) -> None:
+        """Receive a topic from these senders only."""
+        self._bus.hear(topic, senders)
 
     def refused(self) -> list[RefusedMessage]:
         """Return the messages that were not delivered."""

@@ -22,6 +22,7 @@ class Topic:
 
 
 PATH = Topic(name="path", ring=4, max_bytes=4096, reliable=False)
+FAR_PATH = Topic(name="far_path", ring=4, max_bytes=4096, reliable=False)  # the paths that peers out of reach hear too
 STATUS = Topic(name="status", ring=4, max_bytes=20_480, reliable=False)
 TICK = Topic(name="tick", ring=256, max_bytes=4096, reliable=False)
 COMMAND = Topic(name="command", ring=64, max_bytes=1024, reliable=True)
@@ -31,8 +32,8 @@ OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
 MISSION = Topic(name="mission", ring=4, max_bytes=MAX_MISSION_BYTES, reliable=True)
 TRAJECTORY = Topic(name="trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
 RELAY = Topic(name="relay", ring=4, max_bytes=131_072, reliable=False)  # trajectory messages of others
-TOPICS = (PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, MISSION, TRAJECTORY, RELAY)
-FOR_AGENTS = (PATH, STATUS, COMMAND, ENDED, OBSTACLES, MISSION, TRAJECTORY, RELAY)
+TOPICS = (PATH, FAR_PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, MISSION, TRAJECTORY, RELAY)
+FOR_AGENTS = (PATH, FAR_PATH, STATUS, COMMAND, ENDED, OBSTACLES, MISSION, TRAJECTORY, RELAY)
 
 TOO_LONG = b""  # replaces a message that is too long; every decoder refuses it
 

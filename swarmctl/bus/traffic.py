@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from swarmctl.bus.bus import Bus
 from swarmctl.bus.refusals import RefusedMessage
@@ -36,6 +36,10 @@ class CountedBus(Bus):
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
         """Return what has come since the last call."""
         return self._bus.receive(topic)
+
+    def hear(self, topic: Topic, senders: Collection[str]) -> None:
+        """Receive a topic from these senders only."""
+        self._bus.hear(topic, senders)
 
     def refused(self) -> list[RefusedMessage]:
         """Return the messages that were not delivered."""

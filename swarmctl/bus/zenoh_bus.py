@@ -12,7 +12,7 @@ import json
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -54,7 +54,7 @@ class _Joined:
 
     session: Any
     publishers: Mapping[Topic, Any]
-    subscribers: Mapping[Topic, Sequence[tuple[str, Any]]]  # by topic, with the sender of each
+    subscribers: Mapping[Topic, dict[str, Any]]  # by topic and sender
     tokens: Any  # subscriber of liveliness tokens
     own_token: Any
 
@@ -93,10 +93,11 @@ class ZenohBus(Bus):
         deaf_s: float = DEAF_S,
     ) -> None:
         self._me, self._seal_bytes = me, seal_bytes
-        self._socket = socket_file(endpoint)
+        self._socket, self._prefix = socket_file(endpoint), f"swarm/{run}"
+        self._subscriptions = dict(subscriptions)
         self._tokens_key = f"swarm/{run}/*/alive"
         self._join: Callable[[], _Joined] = partial(
-            _join, endpoint, f"swarm/{run}", me, subscriptions, lease_ms, connect_timeout_ms
+            _join, endpoint, self._prefix, me, self._subscriptions, lease_ms, connect_timeout_ms
         )
         self._alive: frozenset[str] = frozenset()
         self._arrivals: Counter[str] = Counter()
@@ -116,7 +117,7 @@ class ZenohBus(Bus):
         """Return (sender, payload) of a topic, oldest first for each sender, at most one ring of each."""
         self._take_over()
         arrived: list[tuple[str, bytes]] = []
-        for sender, subscriber in self._now.subscribers.get(topic, ()):
+        for sender, subscriber in self._now.subscribers.get(topic, {}).items():
             if samples := _drain(subscriber, topic.ring):  # there is nothing from most, in most ticks
                 payloads, most_bytes = (sample.payload for sample in samples), topic.max_bytes + self._seal_bytes
                 arrived += [(sender, p.to_bytes() if len(p) <= most_bytes else TOO_LONG) for p in payloads]
@@ -125,6 +126,11 @@ class ZenohBus(Bus):
         if self._silence.is_deaf(time.monotonic()):
             self.reopen()
         return arrived
+
+    def hear(self, topic: Topic, senders: Collection[str]) -> None:
+        """Receive a topic from these senders only; what has come from others is dropped."""
+        self._subscriptions[topic] = tuple(senders)
+        self._subscribe(topic)
 
     def alive(self) -> frozenset[str]:
         """Return senders whose liveliness token is present; none, not even this one, while the router is lost."""
@@ -173,6 +179,8 @@ class ZenohBus(Bus):
         if self._next is None:
             return
         before, self._now, self._next = self._now, self._next, None
+        for topic in self._now.subscribers:
+            self._subscribe(topic)  # what has changed since it was opened
         self._reopened += 1
         known, self._alive = self._alive, frozenset()
         arrivals = self._arrivals.copy()
@@ -180,6 +188,16 @@ class ZenohBus(Bus):
         arrivals.update(self._alive - known)  # who was known has not joined now
         self._arrivals = arrivals
         threading.Thread(target=close_session, args=(before.session,), name="bus-close", daemon=True).start()
+
+    def _subscribe(self, topic: Topic) -> None:
+        """Declare the subscribers of a topic that the session lacks, and undeclare those that it has no use for."""
+        now, wanted = self._now.subscribers[topic], self._subscriptions[topic]
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            for sender in now.keys() - set(wanted):
+                now.pop(sender).undeclare()
+            for sender in wanted:
+                if sender not in now:
+                    now[sender] = _subscriber(self._now.session, f"{self._prefix}/{sender}/{topic.name}", topic)
 
     def _is_linked(self) -> bool:
         """Return whether the session is linked to a router; the own token is not told of where it moves to another."""
@@ -210,8 +228,8 @@ def _join(
     session = _open_client(endpoint, lease_ms, connect_timeout_ms)
     publishers = {topic: _publisher(session, f"{prefix}/{me}/{topic.name}", topic) for topic in TOPICS}
     subscribers = {
-        topic: [(sender, _subscriber(session, f"{prefix}/{sender}/{topic.name}", topic)) for sender in senders]
-        for topic, senders in subscriptions.items()
+        topic: {sender: _subscriber(session, f"{prefix}/{sender}/{topic.name}", topic) for sender in senders}
+        for topic, senders in dict(subscriptions).items()
     }
     ring: Any = zenoh.handlers.RingChannel(_ALIVE_RING)
     return _Joined(

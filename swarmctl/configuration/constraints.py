@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 
+from swarmctl.agent.sharing.path_sharing import PathSharingParams
 from swarmctl.bus.network.hosts import HostParams
 from swarmctl.configuration.sections import LimitParams, SitlParams, VehicleParams
 from swarmctl.control.collision.barrier import BarrierParams
@@ -19,6 +20,7 @@ from swarmctl.mavlink.geofence import GeofenceParams, is_inside
 from swarmctl.mavlink.transport import Endpoint, parse_url
 
 _PAIRS_SHOWN = 3
+_LEAST_FAR_HZ = 5.0  # a bus on which several are not heard for 0.3 s is lost
 
 
 def own_controller_problems(
@@ -31,6 +33,20 @@ def own_controller_problems(
         yield (
             f"controller.kind = {controller.kind!r} with separation.mode = 'guaranteed': commitments are tracked"
             " by built-in controllers; set separation.mode = 'best_effort'"
+        )
+
+
+def path_sharing_problems(sharing: PathSharingParams, separation: SeparationParams) -> Iterator[str]:
+    """Yield what does not go with paths that only peers within reach hear all of."""
+    if 0.0 < sharing.far_hz < _LEAST_FAR_HZ:
+        yield (
+            f"agent.path_sharing.far_hz = {sharing.far_hz:g}: allowed: 0, or {_LEAST_FAR_HZ:g} to 25; peers heard less "
+            "often count as silent"
+        )
+    if sharing.far_hz and separation.mode == "guaranteed":
+        yield (
+            f"agent.path_sharing.far_hz = {sharing.far_hz:g} with separation.mode = 'guaranteed': commitments are not "
+            "predicted paths; set it to 0"
         )
 
 

@@ -292,3 +292,25 @@ def test_router_ignores_ctrl_c_and_dies_with_a_killed_parent() -> None:
     parent.wait(WAIT_S)
     parent.stdout.close()
     assert until(lambda: not directory.exists()), "socket and directory are gone although nobody asked the router"
+
+
+def test_who_is_heard_can_change_in_flight(join: Callable[..., ZenohBus]) -> None:
+    agent, one, two = join("agent-0", {PATH: ["agent-1", "agent-2"]}), join("agent-1"), join("agent-2")
+    assert until(lambda: agent.alive() == {"agent-0", "agent-1", "agent-2"})
+
+    def heard() -> set[str]:
+        one.publish(PATH, b"one")
+        two.publish(PATH, b"two")
+        return {sender for sender, _ in agent.receive(PATH)}
+
+    assert until(lambda: heard() == {"agent-1", "agent-2"})
+    agent.hear(PATH, ["agent-2"])
+    assert until(lambda: heard() == {"agent-2"})
+    deadline_s = time.monotonic() + 0.5
+    while time.monotonic() < deadline_s:
+        assert "agent-1" not in heard()
+        time.sleep(0.02)
+    agent.hear(PATH, ["agent-1", "agent-2"])
+    began_s = time.monotonic()
+    assert until(lambda: "agent-1" in heard())
+    assert time.monotonic() - began_s < WAIT_S

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import ListedObstacle, StatusMessage, decode_obstacles, decode_status
+from swarmctl.bus.messages.path_messages import stamp_us
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import PeerPaths, peer_verifiers
@@ -80,7 +81,7 @@ class WorldModel:
     def receive(self, utc_us: int) -> list[Order]:
         """Process everything that has arrived; returns the operator's orders to this agent."""
         self.presence.update(utc_us)
-        for sender, payload in self._bus.receive(topics.PATH):
+        for sender, payload in self._received_paths():
             self.paths.offer(sender, payload, utc_us)
         for sender, payload in self._bus.receive(topics.STATUS):
             self._take_status(sender, payload, utc_us)
@@ -95,6 +96,11 @@ class WorldModel:
         self.refusals.report(utc_us)
         self._watch_unresponsive(utc_us)
         return [order for order in orders if order is not None]
+
+    def _received_paths(self) -> list[tuple[str, bytes]]:
+        """Return the paths that have come on both topics, oldest first for each sender."""
+        far, near = self._bus.receive(topics.FAR_PATH), self._bus.receive(topics.PATH)
+        return sorted(far + near, key=lambda item: stamp_us(item[1])) if far else near
 
     def _end_of_a_peer(self, sender: str, payload: bytes, utc_us: int) -> Order | None:
         """Return the order to go on without a peer, from who runs its process and has seen it end; or None."""

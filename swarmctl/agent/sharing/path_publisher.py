@@ -34,6 +34,7 @@ class PathPublisher:
         self._dt_us, self._steps, self._widens_in_gusts = controller.dt_us, controller.steps, widens_in_gusts
         self._sharing = PathSharing(setup.params.path_sharing, setup.separation)
         self._gust = GustWatch()
+        self._far_due_us = 0  # when the next path is one that all hear
 
     def publish(
         self,
@@ -60,9 +61,18 @@ class PathPublisher:
         if state is None:
             return
         margin_m = min(MAX_MARGIN_M, sum((*margins_m, self._gust.margin_m)))
-        path = self._sharing.choose(self._path(state, flown, seq, margin_m))
+        topic = self._topic()
+        path = self._sharing.choose(self._path(state, flown, seq, margin_m), always=topic is topics.FAR_PATH)
         if path is not None:
-            self._ports.bus.publish(topics.PATH, encode_path(path, compact=self._setup.params.path_sharing.compact))
+            self._ports.bus.publish(topic, encode_path(path, compact=self._setup.params.path_sharing.compact))
+
+    def _topic(self) -> topics.Topic:
+        """Return the topic of this tick's path: that of peers within reach, or at times that of all."""
+        far_hz, now_us = self._setup.params.path_sharing.far_hz, self._ports.clock.now_us()
+        if not far_hz or now_us < self._far_due_us:
+            return topics.PATH
+        self._far_due_us = now_us + round(1e6 / far_hz)
+        return topics.FAR_PATH
 
     def _path(self, state: VehicleState, flown: Plan | None, seq: int, margin_m: float) -> PredictedPath:
         if flown is not None:

@@ -17,6 +17,7 @@ class PathSharingParams(Params):
 
     error_m: float = Field(0.0, ge=0, le=0.5)  # by which peers' copy of the path may be off now; 0: share every tick
     heartbeat_s: float = Field(0.1, gt=0, le=0.25)  # peers' copy is never older; they widen distances with its age
+    far_hz: float = Field(0.0, ge=0, le=25)  # rate heard of peers out of reach, 5 or more; 0: all paths are heard
     compact: bool = False  # a third of the bytes, for radio links: points are rounded, by less than a millimetre
 
 
@@ -37,9 +38,9 @@ class PathSharing:
         self._params, self._separation = params, separation
         self._shared: PredictedPath | None = None  # as predicted, without the margin for what is not published
 
-    def choose(self, path: PredictedPath) -> PredictedPath | None:
-        """Return the path to publish in this tick, or None when peers need none."""
-        if not self._is_due(path):
+    def choose(self, path: PredictedPath, *, always: bool = False) -> PredictedPath | None:
+        """Return the path to publish in this tick, or None when peers need none, unless there `always` is one."""
+        if not (always or self._is_due(path)):
             return None
         self._shared = path
         margin_m = min(MAX_MARGIN_M, path.margin_m + self._params.error_m)

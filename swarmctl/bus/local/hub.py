@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from operator import itemgetter
 from typing import NamedTuple
@@ -117,7 +117,7 @@ class LocalHub:
     def detach(self, name: str) -> None:
         """Detach a participant: it sends and receives nothing more; its messages under way still arrive."""
         self._attached.pop(name, None)
-        self._receivers.clear()
+        self.forget_receivers()
         self._views.pop(name, None)
         self._update_views()
 
@@ -159,6 +159,10 @@ class LocalHub:
         if missed and topic.reliable:
             self._held.append(_Held(sender, topic, payload, frozenset(missed)))
 
+    def forget_receivers(self) -> None:
+        """Find out anew who receives what: somebody subscribes to others than before."""
+        self._receivers.clear()
+
     def _receivers_of(self, sender: str, topic: Topic) -> list[_Receiver]:
         """Return the subscribers, and where a link draws for each message, all others: what one hears changes no draw.
 
@@ -199,7 +203,7 @@ class LocalBus(Bus):
     def __init__(self, hub: LocalHub, name: str, subscriptions: Subscriptions) -> None:
         self._hub = hub
         self.name = name
-        self._subscriptions = subscriptions
+        self._subscriptions = dict(subscriptions)
         self._inboxes: dict[Topic, dict[str, deque[Message]]] = {topic: {} for topic in subscriptions}
 
     def publish(self, topic: Topic, payload: bytes) -> None:
@@ -220,6 +224,13 @@ class LocalBus(Bus):
         if len(arrived) > 1:
             arrived.sort(key=itemgetter(0, 1))  # stable: keeps the order of each sender
         return [(sender, payload) for _, sender, payload in arrived]
+
+    def hear(self, topic: Topic, senders: Collection[str]) -> None:
+        self._subscriptions[topic] = tuple(senders)
+        inboxes_of_topic = self._inboxes.setdefault(topic, {})
+        for sender in inboxes_of_topic.keys() - set(senders):
+            del inboxes_of_topic[sender]
+        self._hub.forget_receivers()
 
     def alive(self) -> frozenset[str]:
         return self._hub.alive(self.name) if self._hub.is_attached(self) else frozenset()

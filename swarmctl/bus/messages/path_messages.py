@@ -81,6 +81,11 @@ def _exponent(pos_ned_m: Array) -> int | None:
     return next(e for e in range(_FINEST, _COARSEST + 1) if largest_m <= _LARGEST_BEND * 2.0**e)
 
 
+def stamp_us(payload: bytes) -> int:
+    """Return the UTC [us] of the first point of a path, unchecked; 0 where there is none."""
+    return int(_HEADER.unpack_from(payload)[6]) if len(payload) >= _HEADER.size else 0
+
+
 def decode_path(payload: bytes) -> PredictedPath | None:
     """Decode a path; None unless magic, version, lengths and all numbers are valid."""
     if len(payload) < _HEADER.size:

@@ -11,12 +11,24 @@ from collections.abc import Mapping
 from typing import Any
 
 from swarmctl.bus.network.roster import Roster, Speaker
-from swarmctl.bus.topics import ANSWER, COMMAND, ENDED, MISSION, OBSTACLES, PATH, RELAY, STATUS, TICK, TRAJECTORY
+from swarmctl.bus.topics import (
+    ANSWER,
+    COMMAND,
+    ENDED,
+    FAR_PATH,
+    MISSION,
+    OBSTACLES,
+    PATH,
+    RELAY,
+    STATUS,
+    TICK,
+    TRAJECTORY,
+)
 
 _LISTENING = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query", "query")
 _SPEAKING = ("put", "delete", "liveliness_token", "declare_queryable", "reply")
 _ALIVE = "alive"  # of liveliness tokens
-_OF_AGENTS = (*(topic.name for topic in (PATH, STATUS, TICK, ANSWER, TRAJECTORY, RELAY)), _ALIVE)
+_OF_AGENTS = (*(topic.name for topic in (PATH, FAR_PATH, STATUS, TICK, ANSWER, TRAJECTORY, RELAY)), _ALIVE)
 _OF_COMPUTERS = (ENDED.name, _ALIVE)
 _OF_OPERATORS = (COMMAND.name, MISSION.name, OBSTACLES.name)
 _EVERYTHING = "swarm/**"

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from types import MappingProxyType
 
 from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.seals import Sealer, SealVerifier
 from swarmctl.bus.refusals import REPLAYED, RefusedMessage
-from swarmctl.bus.topics import OBSTACLES, PATH, STATUS, TOO_LONG, TRAJECTORY, Topic
+from swarmctl.bus.topics import FAR_PATH, OBSTACLES, PATH, STATUS, TOO_LONG, TRAJECTORY, Topic
 
 _FOR_FLIGHT_US = 10_000_000  # clocks that are farther apart are not corrected, see `commitment_messages`
 _FOR_LISTS_US = 60_000_000
 FOR_AGENTS_US: Mapping[str, int] = MappingProxyType(
-    {topic.name: _FOR_FLIGHT_US for topic in (PATH, STATUS, TRAJECTORY)} | {OBSTACLES.name: _FOR_LISTS_US}
+    {topic.name: _FOR_FLIGHT_US for topic in (PATH, FAR_PATH, STATUS, TRAJECTORY)} | {OBSTACLES.name: _FOR_LISTS_US}
 )
 # An operator has to understand agents whatever its clock: it stamps orders by what their statuses say.
 FOR_OPERATORS_US: Mapping[str, int] = MappingProxyType({OBSTACLES.name: _FOR_LISTS_US})
@@ -60,6 +60,10 @@ class SealedBus(Bus):
     def relay(self, agents: Iterable[int]) -> int:
         """Pass on messages of other agents, as those have sealed them."""
         return self._bus.relay(agents)
+
+    def hear(self, topic: Topic, senders: Collection[str]) -> None:
+        """Receive a topic from these senders only."""
+        self._bus.hear(topic, senders)
 
     def refused(self) -> list[RefusedMessage]:
         """Return the messages refused since the last call."""

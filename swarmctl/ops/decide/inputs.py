@@ -7,7 +7,7 @@ their ticks, orders and lists of obstacles from the events. What the agent sends
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -97,6 +97,9 @@ class RecordedBus(Bus):
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
         return self._waiting.pop(topic, [])
+
+    def hear(self, topic: Topic, senders: Collection[str]) -> None:
+        """Hear what was heard."""
 
     def alive(self) -> frozenset[str]:
         return self._senders

@@ -1,0 +1,92 @@
+"""A swarm wider than what its vehicles reach: few paths are heard, and who meets knows each other as before."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.agent.sharing.interest import Interest
+from swarmctl.bus import topics
+from swarmctl.bus.local.hub import LocalBus
+from swarmctl.bus.topics import Topic
+from tests.closed_loop.conftest import COARSE, Flight, fly_now
+
+FAR = "agent.path_sharing.far_hz=5"
+MET_M = 3.0
+TICK_S = 0.04  # of COARSE
+
+
+def to_goals(starts: list[list[float]], goals: list[list[float]], *more: str) -> Flight:
+    """Fly every agent to its goal."""
+
+    def arrived(lockstep: Lockstep) -> bool:
+        off_m = np.linalg.norm(lockstep.world.truth_rows()["pos_ned_m"] - np.array(goals), axis=1)
+        return bool(off_m.max() < 0.1)
+
+    return fly_now(
+        *COARSE,
+        *("sitl.start=air", f"swarm.agents={len(starts)}", f"start.positions_ned_m={json.dumps(starts)}"),
+        *("mission.kind=goto", f"mission.goto.goals_ned_m={json.dumps(goals)}", "mission.duration_s=25"),
+        *more,
+        until=arrived,
+    )
+
+
+def paths_heard(*more: str) -> tuple[Flight, int]:
+    """Fly two pairs that swap 30 m from each other; return how many paths were received in all."""
+    starts = [[x, y, -3.0] for x in (0.0, 30.0) for y in (-3.0, 3.0)]
+    counts: Counter[str] = Counter()
+    receive: Callable[[LocalBus, Topic], list[tuple[str, bytes]]] = LocalBus.receive
+
+    def counted(self: LocalBus, topic: Topic) -> list[tuple[str, bytes]]:
+        arrived = receive(self, topic)
+        counts[topic.name] += len(arrived)
+        return arrived
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LocalBus, "receive", counted)
+        flight = to_goals(starts, [starts[i] for i in (1, 0, 3, 2)], *more)
+    return flight, counts[topics.PATH.name] + counts[topics.FAR_PATH.name]
+
+
+def test_few_paths_are_heard_of_those_out_of_reach() -> None:
+    """Each agent has one peer near, heard 25 times a second, and two that it hears 5 times a second."""
+    flight, heard = paths_heard(FAR)
+    everything, all_heard = paths_heard()
+    assert heard < 0.55 * all_heard
+    assert flight.separation_m() >= 0.85
+    assert everything.separation_m() >= 0.85
+
+
+def oldest_path_s(flight: Flight) -> float:
+    """Return the age of the oldest path by which one of two agents that met planned [s]."""
+    ages_s = []
+    for agent in range(2):
+        ticks = flight.ticks(agent)
+        met = ticks[ticks["nearest_peer_m"] < MET_M]
+        assert len(met)
+        ages_s.append(float(met["plan_staleness_ms"].max()) * 1e-3)
+    return max(ages_s)
+
+
+def head_on() -> Flight:
+    """Fly two agents towards each other from out of reach, at 2 m/s."""
+    starts = [[0.0, -12.0, -3.0], [0.0, 12.0, -3.0]]
+    return to_goals(starts, starts[::-1], FAR)
+
+
+def test_who_comes_from_out_of_reach_is_heard_in_full_before_it_matters() -> None:
+    flight = head_on()
+    assert oldest_path_s(flight) <= 2.5 * TICK_S
+    assert flight.separation_m() >= 0.85
+    assert any(e["event"] == "unresponsive" for log in flight.lockstep.logs for e in log.events) is False
+
+
+def test_negative_control_who_never_gets_within_reach_is_known_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Interest, "_reaches", lambda *_: False)
+    assert oldest_path_s(head_on()) > 4.0 * TICK_S

@@ -1,0 +1,102 @@
+"""Interest management: who is within reach, and what is heard of the others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from swarmctl.agent.sharing.interest import Interest
+from swarmctl.agent.sharing.path_sharing import PathSharingParams
+from swarmctl.bus import topics
+from swarmctl.bus.bus import agent_name
+from swarmctl.bus.local.hub import LocalBus, LocalHub
+from swarmctl.bus.messages.path_messages import encode_path
+from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.refusals import Refusals
+from swarmctl.bus.senders import Presence
+from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.core.clock import SimClock
+from tests import builders
+
+HORIZON_S, FAR_HZ, ACCEL_M_S2, RADIUS_M = 0.8, 5.0, 4.0, 0.9
+AHEAD_S = HORIZON_S + 1.0 / FAR_HZ + 0.2
+REACH_AT_REST_M = RADIUS_M + ACCEL_M_S2 * AHEAD_S**2
+SEPARATION = SeparationParams(age_accel_m_s2=ACCEL_M_S2, radius_m=RADIUS_M)
+
+
+class Listener:
+    """Agent 0 and its interest, beside peer 1."""
+
+    def __init__(self, far_hz: float = FAR_HZ) -> None:
+        self.clock = SimClock()
+        hub = LocalHub(self.clock.now_us)
+        self.bus: LocalBus = hub.connect(agent_name(0), dict.fromkeys(topics.FOR_AGENTS))
+        self.peer = hub.connect(agent_name(1), {})
+        self.paths = PeerPaths([1], 50.0, Refusals(lambda name, **fields: None), Presence(self.bus))
+        self.interest = Interest(
+            PathSharingParams(far_hz=far_hz), SEPARATION, self.bus, self.paths, [1], horizon_s=HORIZON_S
+        )
+        self._seq = 0
+
+    def meets(self, east_m: float, *, own_m_s: float = 0.0, peer_m_s: float = 0.0, late_s: float = 0.0) -> bool:
+        """Return whether peer 1 is within reach, at a distance and with speeds, `late_s` after its newest path."""
+        self.clock.advance(20_000)
+        self._seq += 1
+        pos = np.zeros((41, 3))
+        pos[:, 1] = east_m - peer_m_s * 0.02 * np.arange(41)
+        utc_us = self.clock.utc_us()
+        path = builders.predicted_path(pos_ned_m=pos, seq=self._seq, t0_utc_us=utc_us, dt_us=20_000)
+        self.paths.offer(agent_name(1), encode_path(path), utc_us)
+        state = builders.vehicle_state(pos_ned_m=np.zeros(3), vel_ned_m_s=np.array([0.0, own_m_s, 0.0]))
+        self.interest.update(state, utc_us + round(late_s * 1e6))
+        return self.interest.within_reach == {1}
+
+    def hears(self, topic: topics.Topic) -> bool:
+        """Return whether what the peer says now arrives."""
+        self.peer.publish(topic, b"path")
+        self.clock.advance(20_000)
+        return bool(self.bus.receive(topic))
+
+
+@pytest.mark.parametrize(
+    ("own_m_s", "peer_m_s", "late_s"), [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 3.0, 0.0), (1.0, 1.0, 0.5)]
+)
+def test_reach_is_what_both_can_fly_until_the_peer_is_heard_again(
+    own_m_s: float, peer_m_s: float, late_s: float
+) -> None:
+    ahead_s = AHEAD_S + late_s
+    reach_m = RADIUS_M + (own_m_s + peer_m_s) * ahead_s + ACCEL_M_S2 * ahead_s**2
+    beyond = Listener()
+    assert not beyond.meets(1.11 * reach_m, own_m_s=own_m_s, peer_m_s=peer_m_s, late_s=late_s)
+    assert beyond.meets(0.99 * reach_m, own_m_s=own_m_s, peer_m_s=peer_m_s, late_s=late_s)
+
+
+def test_a_peer_is_left_a_little_farther_away_than_it_is_heard_from() -> None:
+    listener = Listener()
+    assert listener.meets(1.05 * REACH_AT_REST_M), "everybody is within reach at first"
+    assert not listener.meets(1.15 * REACH_AT_REST_M)
+    assert not listener.meets(1.05 * REACH_AT_REST_M)
+    assert listener.meets(0.95 * REACH_AT_REST_M)
+
+
+def test_out_of_reach_only_the_paths_for_all_are_heard() -> None:
+    listener = Listener()
+    assert listener.hears(topics.PATH) and listener.hears(topics.FAR_PATH)
+    listener.meets(2.0 * REACH_AT_REST_M)
+    assert not listener.hears(topics.PATH)
+    assert listener.hears(topics.FAR_PATH)
+    listener.meets(0.5 * REACH_AT_REST_M)
+    assert listener.hears(topics.PATH)
+
+
+def test_without_an_own_state_all_are_within_reach() -> None:
+    listener = Listener()
+    assert not listener.meets(2.0 * REACH_AT_REST_M)
+    listener.interest.update(None, listener.clock.utc_us())
+    assert listener.hears(topics.PATH)
+
+
+def test_without_a_rate_for_those_far_away_all_paths_of_all_are_heard() -> None:
+    listener = Listener(far_hz=0.0)
+    listener.meets(1e3)
+    assert listener.hears(topics.PATH)
