@@ -64,7 +64,8 @@ class PathPublisher:
         topic = self._topic()
         path = self._sharing.choose(self._path(state, flown, seq, margin_m), always=topic is topics.FAR_PATH)
         if path is not None:
-            self._ports.bus.publish(topic, encode_path(path, compact=self._setup.params.path_sharing.compact))
+            compact = topic is topics.FAR_PATH or self._setup.params.path_sharing.compact
+            self._ports.bus.publish(topic, encode_path(path, compact=compact))
 
     def _topic(self) -> topics.Topic:
         """Return the topic of this tick's path: that of peers within reach, or at times that of all."""
