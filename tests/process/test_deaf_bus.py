@@ -5,7 +5,6 @@ How such a session comes about is shown by `tools/deaf_sessions.py`. Here its ea
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -68,8 +67,9 @@ def hears(listener: Bus, talker: Bus, seconds: float) -> bool:
 
 def deafen(bus: ZenohBus) -> None:
     """Take the ears of its session away; it goes on to send, and its token stays."""
-    for _, subscriber in itertools.chain(*bus._now.subscribers.values()):
-        subscriber.undeclare()
+    for subscribers in bus._now.subscribers.values():
+        for subscriber in subscribers.values():
+            subscriber.undeclare()
     bus._now.tokens.undeclare()
 
 
