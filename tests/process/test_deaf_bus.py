@@ -90,6 +90,19 @@ def test_a_deaf_session_is_replaced(endpoint: str) -> None:
         assert listener.reopened() == 1
 
 
+def test_a_session_in_place_of_a_deaf_one_hears_whom_the_other_heard(endpoint: str) -> None:
+    with pair(endpoint, deaf_s=1.0) as (listener, talker):
+        listener.hear(PATH, [])
+        deafen(listener)
+        assert not hears(listener, talker, 0.5)
+        assert hears(listener, talker, 10.0)
+        assert listener.reopened() == 1
+        for _ in range(10):
+            talker.publish(PATH, b"path")
+            time.sleep(0.02)
+        assert listener.receive(PATH) == []
+
+
 def heard_of(listener: ZenohBus, talker: ZenohBus) -> bool:
     until_s = time.monotonic() + 5.0
     while time.monotonic() < until_s:
