@@ -14,11 +14,11 @@ from swarmctl.agent.sharing.interest import Interest
 from swarmctl.bus import topics
 from swarmctl.bus.local.hub import LocalBus
 from swarmctl.bus.topics import Topic
-from tests.closed_loop.conftest import COARSE, Flight, fly_now
+from tests.closed_loop.conftest import Flight, fly_now
 
 FAR = "agent.path_sharing.far_hz=5"
 MET_M = 3.0
-TICK_S = 0.04  # of COARSE
+TICK_S = 0.02
 
 
 def to_goals(starts: list[list[float]], goals: list[list[float]], *more: str) -> Flight:
@@ -29,7 +29,6 @@ def to_goals(starts: list[list[float]], goals: list[list[float]], *more: str) ->
         return bool(off_m.max() < 0.1)
 
     return fly_now(
-        *COARSE,
         *("sitl.start=air", f"swarm.agents={len(starts)}", f"start.positions_ned_m={json.dumps(starts)}"),
         *("mission.kind=goto", f"mission.goto.goals_ned_m={json.dumps(goals)}", "mission.duration_s=25"),
         *more,
@@ -55,7 +54,7 @@ def paths_heard(*more: str) -> tuple[Flight, int]:
 
 
 def test_few_paths_are_heard_of_those_out_of_reach() -> None:
-    """Each agent has one peer near, heard 25 times a second, and two that it hears 5 times a second."""
+    """Each agent has one peer near, heard 50 times a second, and two that it hears 5 times a second."""
     flight, heard = paths_heard(FAR)
     everything, all_heard = paths_heard()
     assert heard < 0.55 * all_heard
