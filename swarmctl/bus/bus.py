@@ -55,3 +55,44 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Leave the bus."""
+
+
+class ForwardingBus(Bus):
+    """A bus that another one carries: all that a subclass does not change is left to that one.
+
+    Args:
+        bus: carries the messages.
+    """
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+
+    def publish(self, topic: Topic, payload: bytes) -> None:
+        self._bus.publish(topic, payload)
+
+    def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
+        return self._bus.receive(topic)
+
+    def hear(self, topic: Topic, senders: Collection[str]) -> None:
+        self._bus.hear(topic, senders)
+
+    def refused(self) -> list[RefusedMessage]:
+        return self._bus.refused()
+
+    def relay(self, agents: Iterable[int]) -> int:
+        return self._bus.relay(agents)
+
+    def alive(self) -> frozenset[str]:
+        return self._bus.alive()
+
+    def arrivals(self) -> Mapping[str, int]:
+        return self._bus.arrivals()
+
+    def reopen(self) -> bool:
+        return self._bus.reopen()
+
+    def reopened(self) -> int:
+        return self._bus.reopened()
+
+    def close(self) -> None:
+        self._bus.close()

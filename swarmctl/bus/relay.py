@@ -9,10 +9,9 @@ The layout is little-endian: a header, then for each message the number of its a
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.refusals import RefusedMessage
+from swarmctl.bus.bus import Bus, ForwardingBus, agent_name
 from swarmctl.bus.topics import RELAY, TOO_LONG, TRAJECTORY, Topic
 from swarmctl.core.trajectory_message import TrajectoryMessage
 
@@ -51,7 +50,7 @@ def decode_relay(payload: bytes) -> Relayed | None:
     return found if (magic, version, at) == (_MAGIC, RELAY_VERSION, len(payload)) else None
 
 
-class RelayingBus(Bus):
+class RelayingBus(ForwardingBus):
     """A bus whose trajectory messages also arrive by relays.
 
     It works on messages as they are carried: where they are sealed, what a relay delivers is opened like the rest.
@@ -63,13 +62,10 @@ class RelayingBus(Bus):
     """
 
     def __init__(self, bus: Bus, agent: int, peers: Iterable[int]) -> None:
-        self._bus, self._agent = bus, agent
+        super().__init__(bus)
+        self._agent = agent
         self._names = {peer: agent_name(peer) for peer in peers}
         self._newest: dict[str, bytes] = {}  # of each sender, as it was carried
-
-    def publish(self, topic: Topic, payload: bytes) -> None:
-        """Send to all subscribers."""
-        self._bus.publish(topic, payload)
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
         """Return what has come since the last call, what was relayed first."""
@@ -100,34 +96,6 @@ class RelayingBus(Bus):
             names = [(self._names[agent], carried) for agent, carried in messages if agent in self._names]
             found += [item for item in names if self._newest.get(item[0]) != item[1] and item not in found]
         return found
-
-    def hear(self, topic: Topic, senders: Collection[str]) -> None:
-        """Receive a topic from these senders only."""
-        self._bus.hear(topic, senders)
-
-    def refused(self) -> list[RefusedMessage]:
-        """Return the messages that were not delivered."""
-        return self._bus.refused()
-
-    def alive(self) -> frozenset[str]:
-        """Return senders attached now."""
-        return self._bus.alive()
-
-    def arrivals(self) -> Mapping[str, int]:
-        """Return how often each sender has joined."""
-        return self._bus.arrivals()
-
-    def reopen(self) -> bool:
-        """Open another session in place of this one; return whether one is being opened."""
-        return self._bus.reopen()
-
-    def reopened(self) -> int:
-        """Return how often another session has taken over."""
-        return self._bus.reopened()
-
-    def close(self) -> None:
-        """Leave the bus."""
-        self._bus.close()
 
 
 def missed_by_peers(

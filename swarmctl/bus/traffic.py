@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable
 
-from swarmctl.bus.bus import Bus
-from swarmctl.bus.refusals import RefusedMessage
+from swarmctl.bus.bus import Bus, ForwardingBus
 from swarmctl.bus.topics import RELAY, Topic
 
 
-class CountedBus(Bus):
+class CountedBus(ForwardingBus):
     """A bus that counts the messages and bytes it is given to publish.
 
     Args:
@@ -18,7 +17,7 @@ class CountedBus(Bus):
     """
 
     def __init__(self, bus: Bus) -> None:
-        self._bus = bus
+        super().__init__(bus)
         self._messages: Counter[str] = Counter()
         self._bytes: Counter[str] = Counter()
 
@@ -33,18 +32,6 @@ class CountedBus(Bus):
         self._bytes[topic.name] += len(payload)
         self._bus.publish(topic, payload)
 
-    def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
-        """Return what has come since the last call."""
-        return self._bus.receive(topic)
-
-    def hear(self, topic: Topic, senders: Collection[str]) -> None:
-        """Receive a topic from these senders only."""
-        self._bus.hear(topic, senders)
-
-    def refused(self) -> list[RefusedMessage]:
-        """Return the messages that were not delivered."""
-        return self._bus.refused()
-
     def relay(self, agents: Iterable[int]) -> int:
         """Pass on messages of other agents."""
         sent = self._bus.relay(agents)
@@ -52,23 +39,3 @@ class CountedBus(Bus):
             self._messages[RELAY.name] += 1
             self._bytes[RELAY.name] += sent
         return sent
-
-    def alive(self) -> frozenset[str]:
-        """Return senders attached now."""
-        return self._bus.alive()
-
-    def arrivals(self) -> Mapping[str, int]:
-        """Return how often each sender has joined."""
-        return self._bus.arrivals()
-
-    def reopen(self) -> bool:
-        """Open another session in place of this one; return whether one is being opened."""
-        return self._bus.reopen()
-
-    def reopened(self) -> int:
-        """Return how often another session has taken over."""
-        return self._bus.reopened()
-
-    def close(self) -> None:
-        """Leave the bus."""
-        self._bus.close()

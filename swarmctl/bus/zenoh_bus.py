@@ -95,7 +95,7 @@ class ZenohBus(Bus):
         self._me, self._seal_bytes = me, seal_bytes
         self._socket, self._prefix = socket_file(endpoint), f"swarm/{run}"
         self._subscriptions = dict(subscriptions)
-        self._tokens_key = f"swarm/{run}/*/alive"
+        self._tokens_key = f"{self._prefix}/*/alive"
         self._join: Callable[[], _Joined] = partial(
             _join, endpoint, self._prefix, me, self._subscriptions, lease_ms, connect_timeout_ms
         )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
-from swarmctl.bus.bus import Bus
+from swarmctl.bus.bus import Bus, ForwardingBus
 from swarmctl.bus.network.seals import Sealer, SealVerifier
 from swarmctl.bus.refusals import REPLAYED, RefusedMessage
 from swarmctl.bus.topics import FAR_PATH, OBSTACLES, PATH, STATUS, TOO_LONG, TRAJECTORY, Topic
@@ -20,7 +20,7 @@ FOR_OPERATORS_US: Mapping[str, int] = MappingProxyType({OBSTACLES.name: _FOR_LIS
 _MOST_REFUSED = 4096  # kept until they are asked for
 
 
-class SealedBus(Bus):
+class SealedBus(ForwardingBus):
     """Seals what is published, and delivers what verifies.
 
     Args:
@@ -31,7 +31,8 @@ class SealedBus(Bus):
     """
 
     def __init__(self, bus: Bus, sealer: Sealer, verifier: SealVerifier, utc_us: Callable[[], int]) -> None:
-        self._bus, self._sealer, self._verifier, self._utc_us = bus, sealer, verifier, utc_us
+        super().__init__(bus)
+        self._sealer, self._verifier, self._utc_us = sealer, verifier, utc_us
         self._refused: list[RefusedMessage] = []
 
     def publish(self, topic: Topic, payload: bytes) -> None:
@@ -57,35 +58,7 @@ class SealedBus(Bus):
                 self._refused.append(RefusedMessage(sender, topic.name, reason))
         return opened
 
-    def relay(self, agents: Iterable[int]) -> int:
-        """Pass on messages of other agents, as those have sealed them."""
-        return self._bus.relay(agents)
-
-    def hear(self, topic: Topic, senders: Collection[str]) -> None:
-        """Receive a topic from these senders only."""
-        self._bus.hear(topic, senders)
-
     def refused(self) -> list[RefusedMessage]:
         """Return the messages refused since the last call."""
         refused, self._refused = self._refused, []
         return refused
-
-    def alive(self) -> frozenset[str]:
-        """Return senders attached now. Tokens are not sealed: they prove nothing."""
-        return self._bus.alive()
-
-    def arrivals(self) -> Mapping[str, int]:
-        """Return how often each sender has joined."""
-        return self._bus.arrivals()
-
-    def reopen(self) -> bool:
-        """Open another session in place of this one; return whether one is being opened."""
-        return self._bus.reopen()
-
-    def reopened(self) -> int:
-        """Return how often another session has taken over."""
-        return self._bus.reopened()
-
-    def close(self) -> None:
-        """Leave the bus."""
-        self._bus.close()
