@@ -8,6 +8,9 @@ from sitl.studies.campaign.trials import Cell, Trial
 
 COMMITTED_M = 0.8
 TOUCH_M = 0.48
+GUARANTEED_SWAP = Cell(
+    scenario="swap", agents=4, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
+)
 TUBE_M = 0.5 * (COMMITTED_M - TOUCH_M)
 
 

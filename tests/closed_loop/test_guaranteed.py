@@ -9,17 +9,15 @@ import pytest
 
 from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight
-from sitl.studies.campaign.trials import Cell, Row, Trial
+from sitl.studies.campaign.trials import Row, Trial
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.core.clock import ClockError
-from tests.benches.guaranteed_trials import COMMITTED_M, TOUCH_M, events, flown
+from tests.benches.guaranteed_trials import COMMITTED_M, GUARANTEED_SWAP, TOUCH_M, events, flown
 
 
 def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
-    flight = flown(
-        Cell(scenario="swap", agents=4, delay_ms=300.0, loss=0.3, noise="exact", wind_m_s=0.0, protections="guaranteed")
-    )
+    flight = flown(replace(GUARANTEED_SWAP, delay_ms=300.0, loss=0.3))
     row = flight.row(None)
     assert row["outcome"] == "arrived"
     assert row["min_separation_m"] >= COMMITTED_M
@@ -31,17 +29,7 @@ PROMPT_S = 12.0  # worst of eight starts: 11.3 s; agents that lock in the middle
 
 def swap_of_six(traffic_rule: str = "") -> Row:
     """Fly a swap whose plans are late."""
-    cell = Cell(
-        scenario="swap",
-        agents=6,
-        delay_ms=100.0,
-        loss=0.0,
-        noise="exact",
-        wind_m_s=0.0,
-        protections="guaranteed",
-        sets=traffic_rule,
-    )
-    return flown(cell).row(None)
+    return flown(replace(GUARANTEED_SWAP, agents=6, delay_ms=100.0, sets=traffic_rule)).row(None)
 
 
 def test_agents_that_meet_give_way_by_rule_before_all_stand() -> None:
@@ -59,37 +47,20 @@ def test_negative_control_agents_that_give_way_only_after_standing_lock() -> Non
 
 def test_agents_fly_around_where_a_lost_peer_was_committed_to_end() -> None:
     """If recovery did not see it, an agent would stand for good between that place and the lost peer's last path."""
-    assert (
-        flown(
-            Cell(
-                scenario="death",
-                agents=6,
-                delay_ms=100.0,
-                loss=0.0,
-                noise="exact",
-                wind_m_s=0.0,
-                protections="guaranteed",
-            ),
-            3,
-        ).row(None)["outcome"]
-        == "arrived"
-    )
+    flight = flown(replace(GUARANTEED_SWAP, scenario="death", agents=6, delay_ms=100.0), 3)
+    assert flight.row(None)["outcome"] == "arrived"
 
 
 def test_negative_control_agents_that_see_nobody_touch() -> None:
     assert (
-        flown(
-            Cell(scenario="swap", agents=4, delay_ms=300.0, loss=0.3, noise="exact", wind_m_s=0.0, protections="off")
-        ).row(None)["min_separation_m"]
+        flown(replace(GUARANTEED_SWAP, delay_ms=300.0, loss=0.3, protections="off")).row(None)["min_separation_m"]
         < TOUCH_M
     )
 
 
 def flown_by_clocks(ahead_ms: Sequence[float]) -> TrialFlight:
     """Four agents that swap, each by a clock of its own that also drifts."""
-    cell = Cell(
-        scenario="swap", agents=4, delay_ms=50.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
-    )
+    cell = replace(GUARANTEED_SWAP, delay_ms=50.0)
     clocks = {
         agent: ClockError(offset_us=round(1000 * ms), drift_ppm=200.0 * (-1) ** agent)
         for agent, ms in enumerate(ahead_ms)

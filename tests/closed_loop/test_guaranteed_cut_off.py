@@ -13,21 +13,19 @@ import pytest
 from sitl.studies.campaign.conditions.events import Freeze, ScenarioEvent, Split
 from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight, drawn
-from sitl.studies.campaign.trials import Cell, Trial
+from sitl.studies.campaign.trials import Trial
 from swarmctl.agent.planning import coordination
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.bus.bus import agent_name
-from tests.benches.guaranteed_trials import COMMITTED_M, TOUCH_M, events
+from tests.benches.guaranteed_trials import COMMITTED_M, GUARANTEED_SWAP, TOUCH_M, events
 
 
 def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
     """How many trajectories are committed from 1.6 s to 2 s after the bus has fallen apart."""
     flight = TrialFlight(
         Trial(
-            Cell(
-                scenario="swap", agents=4, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
-            ),
+            GUARANTEED_SWAP,
             1,
         ),
         layout_of("swap", 1, 4),
@@ -66,9 +64,7 @@ def test_negative_control_taking_stale_peers_for_lost_commits_against_alive_peer
 
 def disturbed(event: ScenarioEvent, lost: Set[int] = frozenset(), limit_s: float = 12.0) -> TrialFlight:
     """Four agents that swap; those in `lost` need not arrive, and nobody has to stay in the mission."""
-    cell = Cell(
-        scenario="swap", agents=4, delay_ms=50.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
-    )
+    cell = replace(GUARANTEED_SWAP, delay_ms=50.0)
     layout = replace(layout_of("swap", 1, 4), events=(event,), limit_s=limit_s, lost=frozenset(lost))
     flight = TrialFlight(Trial(cell, 1), layout)
     flight.run()
@@ -101,9 +97,7 @@ def test_negative_control_halves_that_take_missing_tokens_for_deaths_collide(mon
 
 def two_of_six_cut_off() -> TrialFlight:
     """A host with two agents is cut off from two other hosts in the middle of a swap, for 5 s."""
-    cell = Cell(
-        scenario="swap", agents=6, delay_ms=20.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
-    )
+    cell = replace(GUARANTEED_SWAP, agents=6, delay_ms=20.0)
     event = Split([frozenset({0, 1, 2, 3}), frozenset({4, 5})], 2.5, 5.0)
     layout = replace(layout_of("swap", 1, 6), events=(event,), limit_s=9.0, lost=frozenset({4, 5}))
     flight = TrialFlight(Trial(cell, 1), layout)
@@ -155,16 +149,7 @@ def test_all_arrive_although_links_fail_for_seconds(relayed: bool, monkeypatch: 
     """Each direction between two agents delivers nothing for two fifths of the time, 2 s at once."""
     if not relayed:
         monkeypatch.setattr(coordination, "missed_by_peers", lambda *_: [])
-    cell = Cell(
-        scenario="swap",
-        agents=4,
-        delay_ms=0.0,
-        loss=0.0,
-        noise="exact",
-        wind_m_s=0.0,
-        protections="guaranteed",
-        disturbance="bursts:0.4",
-    )
+    cell = replace(GUARANTEED_SWAP, disturbance="bursts:0.4")
     flight = TrialFlight(Trial(cell, 2), replace(drawn(cell, 2), limit_s=12.0))
     flight.run()
     assert flight.monitor.min_separation_m >= 0.8

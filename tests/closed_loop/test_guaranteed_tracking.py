@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.trials import Cell
 from swarmctl.agent.planning import coordination
 from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.config import load
@@ -19,7 +19,7 @@ from swarmctl.control.commit import trajectory_planner
 from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import Array, Phase
-from tests.benches.guaranteed_trials import TUBE_M, events, flown
+from tests.benches.guaranteed_trials import GUARANTEED_SWAP, TUBE_M, events, flown
 from tests.closed_loop.conftest import ROOT
 
 
@@ -80,18 +80,7 @@ def test_negative_control_commitments_that_go_on_in_time_are_chased(monkeypatch:
 @pytest.mark.parametrize(("body_m", "told"), [(0.48, False), (0.8, True)])
 def test_a_tracking_violation_is_reported(body_m: float, told: bool) -> None:
     """The error may be half of the committed distance beyond touching bodies; the safety filter deflects large ones."""
-    flight = flown(
-        Cell(
-            scenario="swap",
-            agents=2,
-            delay_ms=0.0,
-            loss=0.0,
-            noise="exact",
-            wind_m_s=0.0,
-            protections="guaranteed",
-            sets=f"separation.body_m={body_m}",
-        )
-    )
+    flight = flown(replace(GUARANTEED_SWAP, agents=2, sets=f"separation.body_m={body_m}"))
     assert flight.row(None)["outcome"] == "arrived"
     off = events(flight, "tracking_violation")
     assert bool(off) is told

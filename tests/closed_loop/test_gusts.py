@@ -11,7 +11,7 @@ from sitl.lockstep import Lockstep
 from sitl.studies.campaign.collision_monitor import CollisionMonitor
 from sitl.studies.campaign.conditions.events import SimulatorFault
 from sitl.studies.campaign.flight import TrialFlight, drawn
-from sitl.studies.campaign.trials import Cell, Trial
+from sitl.studies.campaign.trials import Trial
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.config import load
 from swarmctl.control.commit.protocol import Commitments
@@ -19,6 +19,7 @@ from swarmctl.control.commit.tube import Tube
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Phase
 from swarmctl.simulator_config import FaultParams
+from tests.benches.guaranteed_trials import GUARANTEED_SWAP
 from tests.closed_loop.conftest import ROOT
 
 X500 = ROOT / "configs" / "x500_circle.toml"
@@ -55,18 +56,7 @@ def blown_farther_than_expected() -> CollisionMonitor:
     That is more than is guaranteed: what is shown is that the reaction makes the difference in one flight, not in all.
     From fifteen starts shifted by millimetres two touch with the reaction and four without it; means 1.20 and 0.97 m.
     """
-    cell = Cell(
-        scenario="swap",
-        agents=6,
-        delay_ms=0.0,
-        loss=0.0,
-        noise="exact",
-        wind_m_s=0.0,
-        protections="guaranteed",
-        airframe="x500",
-        disturbance="steps:8",
-        sets="separation.gust_m_s=4",
-    )
+    cell = replace(GUARANTEED_SWAP, agents=6, airframe="x500", disturbance="steps:8", sets="separation.gust_m_s=4")
     flight = TrialFlight(Trial(cell, 1), replace(drawn(cell, 1), limit_s=8.0))
     flight.run()
     return flight.monitor

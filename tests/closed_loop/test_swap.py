@@ -33,10 +33,14 @@ def check(flight: Flight) -> None:
         assert not unsolved.any(), "what OSQP does not finish is solved all the same; by OSQP alone 12 to 22 are not"
 
 
+@pytest.mark.usefixtures("configured_starts")
 def test_eight_agents_swap_without_touching(fly: Fly) -> None:
     flight = fly(*SWAP, config="swap8.toml", until=mission_is_over)
     assert flight.outcomes == {"completed"}
     check(flight)
+    for agent in range(8):
+        acted = flight.ticks(agent)["safety_filter_acted"]
+        assert not acted.any(), "the safety filter is not what keeps them apart"
 
 
 @pytest.mark.parametrize("seed", [1, 2])
