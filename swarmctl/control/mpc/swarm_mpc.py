@@ -30,7 +30,7 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Plan, PlanStatus
 
-_SLACK_M = 0.02  # what a plan may come closer than asked before another is made: four swap at 0.80 m without it, 0.89
+_SLACK_M = 0.02  # what a plan may come closer than asked before another is made: four swap at 0.81 m without it, 0.89
 
 
 class AxisWeights(Params):
