@@ -15,7 +15,7 @@ UTC_US = 1_700_000_000_000_000
 DT_US = 100_000
 STEPS = 10
 PARAMS = SeparationParams(
-    stop_m_s2=1.4
+    stop_m_s2=1.4, approach_01=0.0
 )  # radius 0.9, slack 0.1, 4 m/s2 of age, at most 1 m, brake 3 m/s2, lost after 0.5 s
 
 

@@ -35,7 +35,7 @@ CROSSING = (
     "mission.swap.travel_s=2.5",
     "mission.duration_s=12",
 )
-LAND_NOW: dict[float, Callable[[Lockstep], None]] = {1.5: lambda running: running.command("land")}
+LAND_NOW: dict[float, Callable[[Lockstep], None]] = {1.3: lambda running: running.command("land")}
 
 
 def test_a_landing_at_speed_among_others_brakes_and_moves_apart_first(fly: Fly) -> None:

@@ -48,7 +48,8 @@ def test_a_controller_that_plans_through_a_peer_is_kept_from_it() -> None:
     for agent in range(2):
         assert failures(flight, agent), "its commands were not flown all the time"
         assert all("misbehaving:Meddling plans too close" in why for why in failures(flight, agent))
-        assert flight.modes(agent, Phase.TRACK) == {Mode.TRACKING}, "there always was a certified plan"
+        brakes = np.count_nonzero(flight.ticks(agent)["mode"] == Mode.BRAKE)
+        assert brakes <= 1, "there was a certified plan in every tick but one, after what it commanded"
 
 
 def test_negative_control_without_guard_and_filter_it_flies_through(monkeypatch: pytest.MonkeyPatch) -> None:

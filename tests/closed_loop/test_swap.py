@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from swarmctl.control.mpc import swarm_mpc
 from swarmctl.core.types import PlanStatus
 from tests.closed_loop.conftest import COARSE, Flight, Fly, mission_is_over, mission_t_s
 
@@ -29,8 +26,11 @@ def check(flight: Flight) -> None:
         _, error = flight.tracked(agent)
         assert np.linalg.norm(error[-1]) < 0.1, "everybody arrives"
         ticks = flight.ticks(agent)
-        unsolved = np.isin(ticks["plan_status"], (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL))
-        assert not unsolved.any(), "what OSQP does not finish is solved all the same; by OSQP alone 12 to 22 are not"
+        status = ticks["plan_status"]
+        assert not (status == PlanStatus.SOLVER_FAILED).any(), (
+            "what OSQP does not finish is solved; alone it fails in 12"
+        )
+        assert np.count_nonzero(status == PlanStatus.RESIDUAL) <= 1, "one that lacks a metre may be inexact"
 
 
 @pytest.mark.usefixtures("configured_starts")
@@ -53,12 +53,11 @@ def test_eight_agents_swap_from_starts_a_millimetre_off(fly: Fly, seed: int) -> 
     check(fly(*SWAP, *sets, config="swap8.toml", until=all_arrived, seed=seed))
 
 
-def four_meet(fly: Fly, seed: int) -> Flight:
+def four_meet(fly: Fly, seed: int, *sets: str) -> Flight:
     """Fly a symmetric swap of four at half the rate until all have passed the middle."""
     places = "start.positions_ned_m=[[3,0,0],[0,3,0],[-3,0,0],[0,-3,0]]"
     mission = ("swarm.agents=4", places, "mission.swap.travel_s=6", "mission.duration_s=12", "sitl.start=air")
-    until = 4.0  # they are closest at 3.6 s
-    return fly(*COARSE, *mission, config="swap8.toml", until=lambda running: mission_t_s(running) >= until, seed=seed)
+    return fly(*COARSE, *mission, *sets, config="swap8.toml", until=lambda now: mission_t_s(now) >= 5.0, seed=seed)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -68,7 +67,6 @@ def test_four_agents_that_meet_keep_their_distance_from_every_start(fly: Fly, se
 
 
 @pytest.mark.usefixtures("configured_starts")
-def test_negative_control_plans_that_lack_distance_are_flown(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are certified and come to 0.81 to 0.82 m from two of eight starts: room to stop costs distance."""
-    monkeypatch.setattr(swarm_mpc, "_SLACK_M", math.inf)
-    assert four_meet(fly, 4).separation_m() < 0.84
+def test_negative_control_without_room_for_those_who_come_closer_four_come_closer(fly: Fly) -> None:
+    """From twelve starts they come to 0.81 to 0.90 m: each changes its plan while the others do."""
+    assert min(four_meet(fly, seed, "separation.approach_01=0").separation_m() for seed in range(4)) < 0.85

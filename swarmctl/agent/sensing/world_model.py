@@ -201,6 +201,7 @@ class WorldModel:
                 budget,
                 parked=self._is_in(path.agent, Phase.DONE),
                 landing=descends or self._is_in(path.agent, Phase.LAND),
+                here_ned_m=pos_ned_m,
             )
             for path, points in zip(paths, () if places is None else places, strict=True)
         ]

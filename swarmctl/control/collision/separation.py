@@ -41,7 +41,7 @@ class SeparationParams(Params):
     brake_m_s2: float = Field(3.0, gt=0, le=50)  # assumed braking of a peer beyond its prediction
     lost_after_s: float = Field(0.5, gt=0, le=60)  # a path this old is kept clear of at every height
     gate_m: float = Field(3.0, gt=0, le=1000)  # rows farther than this from being active are left out
-    approach_01: float = Field(0.0, ge=0, le=1)  # plans keep this share more of what two are still to come closer
+    approach_01: float = Field(0.1, ge=0, le=1)  # plans keep this share more of what two are still to come closer
     approach_max_m: float = Field(0.15, ge=0, le=10)  # largest distance added by `approach_01`
     stop_m_s2: float = Field(1.0, gt=0, le=50)  # braking that plans leave room for beyond their horizon
     relax_01: float = Field(0.9, gt=0, le=1)  # share of the reachable displacement a row may ask for
@@ -221,15 +221,23 @@ def keep_out_along(
     *,
     parked: bool,
     landing: bool,
+    here_ned_m: Array | None = None,
 ) -> KeepOut:
     """Return the keep-out of one peer whose positions (steps+1, 3) from `t0_utc_us` on are known already.
 
-    Otherwise as `keep_out_of_peer`; `budget` is that of `params`.
+    Otherwise as `keep_out_of_peer`; `budget` is that of `params`. From a peer that is silent for long one that is at
+    `here_ned_m` (3,) keeps at most its present distance beyond the radius of a fresh path. The margin of age then keeps
+    it from coming closer, and does not drive it away: the silent peer may hear it, and flies by its shared path. Driven
+    away from where the peer is expected, agents came to 0.66 m of where it was.
     """
     age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
+    radius_m = budget.planned_peer_m(path.margin_m, budget.age_margin_m(age_s, parked))
+    if here_ned_m is not None and age_s > params.lost_after_s:
+        apart_m = math.dist(points_ned_m[0, :2], here_ned_m[:2])  # level, as is kept from a silent peer
+        radius_m = min(radius_m, max(apart_m, budget.planned_peer_m(path.margin_m, 0.0)))
     return KeepOut(
         pos_ned_m=points_ned_m,
-        radius_m=budget.planned_peer_m(path.margin_m, budget.age_margin_m(age_s, parked)),
+        radius_m=radius_m,
         hard_min_distance_m=budget.certified_peer_m(path.margin_m),
         any_height=landing or (age_s > params.lost_after_s and not parked),
         priority_id=path.agent,

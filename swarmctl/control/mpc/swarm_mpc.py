@@ -30,7 +30,7 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Plan, PlanStatus
 
-_SLACK_M = 0.02  # what a plan may come closer than asked before another is made: four swap at 0.81 m without it, 0.89
+_SLACK_M = 0.02  # slack from which on a plan is made again
 
 
 class AxisWeights(Params):
@@ -311,8 +311,8 @@ def planned(
     began_ns = stopwatch_ns()
     spaces = spaces_of(separation)
     best = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
-    for relaxed in _relaxed(separation):
-        if spaces is None or not _lacks_distance(best):
+    for relaxed, lacks_distance in _relaxed(separation):
+        if spaces is None or not lacks_distance(best):
             return best
         began_ns, before, spaces = stopwatch_ns(), spaces, spaces_of(relaxed)
         if spaces is not None and not _are_equal(spaces, before):
@@ -320,29 +320,30 @@ def planned(
     return best
 
 
-def _lacks_distance(plan: Plan) -> bool:
-    """Return whether a plan comes closer than asked, by more than `_SLACK_M` or than is ever flown."""
-    return plan.slack_m > _SLACK_M if plan.status is PlanStatus.OK else plan.status is PlanStatus.NOT_CERTIFIED
-
-
 def _better(best: Plan, found: Plan) -> Plan:
-    """Return the plan with less slack of two that may be flown, else the one that may, else the one found last."""
+    """Return the plan with less slack of two that may be flown, else the one that may, else the last one solved."""
     if best.status is PlanStatus.OK:
         return found if found.status is PlanStatus.OK and found.slack_m < best.slack_m else best
-    return found
+    return found if found.status is PlanStatus.OK or _is_refused(found) else best
 
 
-def _relaxed(separation: SeparationParams) -> Iterator[SeparationParams]:
-    """Yield parameters of half-spaces for a plan that lacks distance within those of `separation`.
+def _relaxed(separation: SeparationParams) -> Iterator[tuple[SeparationParams, Callable[[Plan], bool]]]:
+    """Yield parameters of half-spaces for a plan that lacks distance in those before, and whether one does.
 
     - Without the gate: a plan may move far away from a guess that stands still, while half-spaces far from the guess
       are left out. It then runs into peers that are there by the time it arrives, as does the next from that guess.
     - With the harder braking that peers expect beyond the horizon: room to stop has much slack where peers are on
-      several sides, and one slack for each of them lets a plan come too close within the horizon as well.
+      several sides, and one slack for each of them lets a plan come too close within the horizon as well. Only for
+      plans that are refused: agents that fly with less room to stop lack it when a peer drops out.
     """
     every = separation.model_copy(update={"gate_m": math.inf})
-    yield every
-    yield every.model_copy(update={"stop_m_s2": separation.brake_m_s2})
+    yield every, lambda plan: _is_refused(plan) or plan.slack_m > _SLACK_M
+    yield every.model_copy(update={"stop_m_s2": separation.brake_m_s2}), _is_refused
+
+
+def _is_refused(plan: Plan) -> bool:
+    """Return whether a plan comes closer than is ever flown."""
+    return plan.status is PlanStatus.NOT_CERTIFIED
 
 
 def _are_equal(one: HalfSpaces, other: HalfSpaces) -> bool:

@@ -148,8 +148,13 @@ def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height
         bench.peer.publish(topics.PATH, encode_path(path))
     utc_us = bench.clock.utc_us()
     assert bench.world_model.has_unresponsive_peer(utc_us)
-    (kept,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
+    far_ned_m = np.array([5.0, 0.0, 0.0])
+    (kept,) = bench.world_model.keep_outs(HERE + far_ned_m, utc_us, 100_000, 5, phase=Phase.TRACK)
     assert kept.any_height and kept.radius_m > SeparationParams().radius_m + 0.9
+    (kept,) = bench.world_model.keep_outs(HERE + 0.3 * far_ned_m, utc_us, 100_000, 5, phase=Phase.TRACK)
+    assert kept.radius_m == pytest.approx(1.5), "who is nearer comes no closer, and is not driven away"
+    (kept,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
+    assert kept.radius_m == pytest.approx(SeparationParams().radius_m)
     assert bench.world_model.refusals.alert(utc_us) == "path of agent-1 refused: future"
     assert bench.unresponsive == [{"event": "unresponsive", "agent": 1, "begins": True}]
     assert [row["count"] for row in bench.events if row["event"] == "refused"] == [1, 51]
