@@ -28,7 +28,13 @@ def test_true_separation_is_kept_throughout(circle: Flight) -> None:
 
 def test_summed_mean_tracking_error(circle: Flight) -> None:
     assert circle.summed_mean_error_m() <= 2.19, "thesis Table 19 at 3 x 0.3 m"
-    assert circle.summed_mean_error_m(after_s=10.0) <= 1.05 * np.sqrt(3) * 0.9, "within 5 % of the lower bound"
+    assert circle.summed_mean_error_m(after_s=10.0) <= 1.07 * np.sqrt(3) * 0.9, "the lower bound, and up to 7 %"
+
+
+def test_without_more_room_for_who_comes_closer_the_error_is_within_3_percent_of_its_lower_bound(fly: Fly) -> None:
+    """Agents in a formation swing by centimetres, for which `separation.approach_01` keeps room: 2 to 3 %."""
+    flight = fly("separation.approach_01=0", "sitl.start=air", until=mission_is_over)
+    assert flight.summed_mean_error_m(after_s=10.0) <= 1.03 * np.sqrt(3) * 0.9
 
 
 def test_no_plan_fails(circle: Flight) -> None:
