@@ -19,7 +19,7 @@ from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 from tests.closed_loop.conftest import COARSE
 from tests.faults.row import Off
 from tests.faults.rows_agents import lands
-from tests.faults.simulated import ALONE, GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow, tracking
+from tests.faults.simulated import ALONE, GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow
 
 STALE_FLOWN = Off(settings=("agent.failsafe.state_max_age_s=5",))
 ALWAYS_OURS = Off(  # neither the failsafe's table nor the state machine looks at who flies
@@ -147,8 +147,6 @@ ROWS = (
         name="link-bad",
         event="30 % of all MAVLink datagrams are lost, all late by up to 100 ms, a fifth twice, a fifth overtaken",
         reaction="nobody comes too close; the vehicle stays under control, or lands",
-        scene=(*SWAP, "separation.approach_01=0"),  # with more room for who comes closer nobody needs the stamps
-        due=tracking(1.0),
         within_s=8.0,
         protection="the vehicle's own stamps order its states, and tell their age",
         happens=several(
