@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sitl.lockstep import Lockstep
 from sitl.studies.campaign.conditions.events import Freeze, ScenarioEvent, Split
 from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight, drawn
@@ -18,6 +19,8 @@ from swarmctl.agent.planning import coordination
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.bus.bus import agent_name
+from swarmctl.config import load
+from swarmctl.core.types import Phase
 from tests.benches.guaranteed_trials import COMMITTED_M, GUARANTEED_SWAP, TOUCH_M, events
 
 
@@ -154,3 +157,35 @@ def test_all_arrive_although_links_fail_for_seconds(relayed: bool, monkeypatch: 
     flight.run()
     assert flight.monitor.min_separation_m >= 0.8
     assert flight.row(None)["arrived"] is relayed
+
+
+def cut_off_on_the_ground() -> tuple[bool, list[dict[str, Any]]]:
+    """Return whether four agents take off that do not hear the last of them for 5 s before, and who is excluded."""
+    sets = ("swarm.agents=4", "separation.mode=guaranteed", "mission.kind=swap", "agent.rate_hz=25")
+    lockstep = Lockstep(load(None, sets))
+    alone, others = agent_name(3), frozenset(map(agent_name, range(3)))
+
+    def begun() -> bool:
+        return all(log.rows and log.rows[-1]["phase"][0] == Phase.TRACK for log in lockstep.logs)
+
+    while not begun() and lockstep.clock.now_us() < 22_000_000:
+        lockstep.step()
+        if lockstep.clock.now_us() == 2_400_000:  # all have seen their vehicles, and heard each other
+            lockstep.hub.split([frozenset({alone}), others])
+        if lockstep.clock.now_us() == 7_400_000:
+            lockstep.hub.heal()
+    return begun(), [e for log in lockstep.logs for e in log.events if e["event"] == "membership" and e["excluded"]]
+
+
+def test_nobody_is_excluded_for_silence_before_anybody_flies() -> None:
+    assert cut_off_on_the_ground() == (True, [])
+
+
+def test_negative_control_who_is_excluded_on_the_ground_is_waited_for_in_vain(monkeypatch: pytest.MonkeyPatch) -> None:
+    def by_silence(self: Coordination, utc_us: int) -> set[int]:
+        return {i for i in self._peers - self._ended if self._silence_us(i, utc_us) > coordination._SUSPECT_US}
+
+    monkeypatch.setattr(Coordination, "_suspected", by_silence)
+    begun, excluded = cut_off_on_the_ground()
+    assert not begun
+    assert excluded

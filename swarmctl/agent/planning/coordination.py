@@ -133,7 +133,7 @@ class Coordination:
     def _update_membership(self, utc_us: int) -> None:
         peers, membership = self._peer_trajectories, self._membership
         self._ended = frozenset(agent for agent in self._peers if self._world_model.has_ended(agent))
-        suspected = {agent for agent in self._peers - self._ended if self._silence_us(agent, utc_us) > _SUSPECT_US}
+        suspected = self._suspected(utc_us)
         told = {agent: message.exclusions for agent, message in peers.newest.items()}
         membership.update(suspected, told, self._ended, votes=peers.heard_before_flight == self._peers)
         said = (membership.exclusions.suspected, membership.exclusions.promised, membership.excluded)
@@ -141,6 +141,13 @@ class Coordination:
             self._membership_said = said
             suspected_, promised, excluded = (sorted(agents) for agents in said)
             self._note("membership", suspected=suspected_, promised=promised, excluded=excluded)
+
+    def _suspected(self, utc_us: int) -> set[int]:
+        """Return the peers that have not been heard for long; before anybody flies nobody is, as all wait for all."""
+        messages = self._peer_trajectories.newest.values()
+        if self._begun_us is None and not any(message.is_committed for message in messages):
+            return set()
+        return {agent for agent in self._peers - self._ended if self._silence_us(agent, utc_us) > _SUSPECT_US}
 
     def step(
         self, utc_us: int, state: VehicleState, phase: Phase, desired: DesiredReference, *, disturbance_ned_m_s2: Array
