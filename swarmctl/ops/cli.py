@@ -5,10 +5,12 @@ Heavy modules are imported inside the verb that needs them, so that `--help` ans
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -68,7 +70,19 @@ def main() -> None:
         sys.stdout.flush()
     except OSError:  # the reader has closed the pipe; the interpreter would change the exit code
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if _bus_is_blocked():
+        atexit._run_exitfuncs()
+        os._exit(code)
     sys.exit(code)
+
+
+def _bus_is_blocked() -> bool:
+    """Return whether a thread still opens or closes a session of the bus, as without a router.
+
+    When the interpreter ends, Python unwinds such a thread when it returns. Zenoh's frames abort the process then:
+    a launch whose router was lost ended with -6.
+    """
+    return any(thread.name.startswith("bus-") for thread in threading.enumerate())
 
 
 def _run_app() -> int:
