@@ -153,7 +153,7 @@ class Lockstep:
     def _agent(self, index: int, transport: Any) -> Agent:
         log = self.logs[index]
         others = [i for i in range(self.config.swarm.agents) if i != index]
-        bus = RelayingBus(self.hub.connect(agent_name(index), dict.fromkeys(topics.FOR_AGENTS)), index, others)
+        bus = RelayingBus(self.hub.connect(agent_name(index), dict.fromkeys(topics.FOR_AGENTS)), others)
         boot_id = self.config.seed * 1000 + index
         config = self._own.get(index, self.config)
         key = self._keys[index]

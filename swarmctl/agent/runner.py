@@ -218,7 +218,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
         max_age_us=FOR_AGENTS_US,
         utc_us=clock.utc_us,
         lease_ms=config.bus.lease_ms,
-        carrier=lambda bus: RelayingBus(bus, process.agent, others),
+        carrier=lambda bus: RelayingBus(bus, others),
     )
 
 

@@ -57,13 +57,11 @@ class RelayingBus(ForwardingBus):
 
     Args:
         bus: carries the messages.
-        agent: own number.
         peers: numbers of the other agents.
     """
 
-    def __init__(self, bus: Bus, agent: int, peers: Iterable[int]) -> None:
+    def __init__(self, bus: Bus, peers: Iterable[int]) -> None:
         super().__init__(bus)
-        self._agent = agent
         self._names = {peer: agent_name(peer) for peer in peers}
         self._newest: dict[str, bytes] = {}  # of each sender, as it was carried
 

@@ -29,6 +29,7 @@ SCHEME = "unixsock-stream/"
 NO_BUS = "none"  # endpoint of an agent without a bus
 CONNECT_TIMEOUT_MS = 10_000
 CLOSE_DEADLINE_S = 2.0
+_THREADS = "bus-"  # how names of threads begin that open and close sessions
 _MAX_MESSAGE_BYTES = 1 << 20
 _ALIVE_RING = 1024
 _WHO_IS_THERE_S = 5.0  # longest that a new session asks before it takes over
@@ -148,7 +149,7 @@ class ZenohBus(Bus):
             return True
         if self._is_closed or not self._socket.exists():
             return False
-        self._opening = threading.Thread(target=self._open_next, name="bus-reopen", daemon=True)
+        self._opening = threading.Thread(target=self._open_next, name=f"{_THREADS}reopen", daemon=True)
         self._opening.start()
         return True
 
@@ -187,7 +188,7 @@ class ZenohBus(Bus):
         self._watch_tokens()
         arrivals.update(self._alive - known)  # who was known has not joined now
         self._arrivals = arrivals
-        threading.Thread(target=close_session, args=(before.session,), name="bus-close", daemon=True).start()
+        threading.Thread(target=close_session, args=(before.session,), name=f"{_THREADS}close", daemon=True).start()
 
     def _subscribe(self, topic: Topic) -> None:
         """Declare the subscribers of a topic that the session lacks, and undeclare those that it has no use for."""
@@ -314,8 +315,17 @@ def close_session(session: Any) -> None:
         session.close()
 
 
+def is_blocked() -> bool:
+    """Return whether a thread of this process still opens or closes a session, as without a router.
+
+    When the interpreter ends, Python unwinds such a thread when it returns. Zenoh's frames abort the process then:
+    a launch whose router was lost ended with -6.
+    """
+    return any(thread.name.startswith(_THREADS) for thread in threading.enumerate())
+
+
 def close_within(session: Any, deadline_s: float) -> None:
     """Close a session; give up after the deadline, since a link without its other end can block."""
-    closer = threading.Thread(target=close_session, args=(session,), name="bus-close", daemon=True)
+    closer = threading.Thread(target=close_session, args=(session,), name=f"{_THREADS}close", daemon=True)
     closer.start()
     closer.join(deadline_s)

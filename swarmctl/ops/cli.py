@@ -10,7 +10,6 @@ import contextlib
 import os
 import signal
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -77,12 +76,9 @@ def main() -> None:
 
 
 def _bus_is_blocked() -> bool:
-    """Return whether a thread still opens or closes a session of the bus, as without a router.
-
-    When the interpreter ends, Python unwinds such a thread when it returns. Zenoh's frames abort the process then:
-    a launch whose router was lost ended with -6.
-    """
-    return any(thread.name.startswith("bus-") for thread in threading.enumerate())
+    """Return whether the bus, where a verb has loaded it, would abort the process as the interpreter ends."""
+    bus = sys.modules.get("swarmctl.bus.zenoh_bus")
+    return bus is not None and bus.is_blocked()
 
 
 def _run_app() -> int:

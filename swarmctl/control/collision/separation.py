@@ -225,10 +225,11 @@ def keep_out_along(
 ) -> KeepOut:
     """Return the keep-out of one peer whose positions (steps+1, 3) from `t0_utc_us` on are known already.
 
-    Otherwise as `keep_out_of_peer`; `budget` is that of `params`. From a peer that is silent for long one that is at
-    `here_ned_m` (3,) keeps at most its present distance beyond the radius of a fresh path. The margin of age then keeps
-    it from coming closer, and does not drive it away: the silent peer may hear it, and flies by its shared path. Driven
-    away from where the peer is expected, agents came to 0.66 m of where it was.
+    Otherwise as `keep_out_of_peer`; `budget` is that of `params`, `here_ned_m` (3,) the own position; None if unknown.
+
+    Where a path is older than `lost_after_s`, its margin of age makes the radius no larger than the present distance:
+    it keeps this agent from coming closer, and does not drive it away. The silent peer may hear this agent, and count
+    on its shared path. Driven away from where the peer was expected, agents came to 0.66 m of where it was.
     """
     age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
     radius_m = budget.planned_peer_m(path.margin_m, budget.age_margin_m(age_s, parked))

@@ -101,7 +101,7 @@ class Scene:
         verifier = SealVerifier(self.roster, keys, RUN, me="alpha", max_age_us=FOR_AGENTS_US)
         if not self.seals:
             verifier.open = self.believe  # type: ignore[method-assign]
-        self.bus = SealedBus(RelayingBus(bus, 0, [1, 2]), Sealer(keys, RUN, ME, session=1), verifier, self.clock.utc_us)
+        self.bus = SealedBus(RelayingBus(bus, [1, 2]), Sealer(keys, RUN, ME, session=1), verifier, self.clock.utc_us)
         vouchers = {host: frozenset((number,)) for number, host in enumerate(self.roster.hosts)}
         self.world = WorldModel(
             0,

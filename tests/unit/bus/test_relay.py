@@ -54,9 +54,7 @@ class Three:
     def __init__(self) -> None:
         self.clock = SimClock()
         self.hub = LocalHub(self.clock.now_us)
-        self.buses = [
-            RelayingBus(self.hub.connect(agent_name(i)), i, [j for j in range(3) if j != i]) for i in range(3)
-        ]
+        self.buses = [RelayingBus(self.hub.connect(agent_name(i)), [j for j in range(3) if j != i]) for i in range(3)]
         self.hub.cut(agent_name(0), agent_name(2))
         self.hub.cut(agent_name(2), agent_name(0))
 
