@@ -99,10 +99,10 @@ def test_negative_control_halves_that_take_missing_tokens_for_deaths_collide(mon
 
 
 def two_of_six_cut_off() -> TrialFlight:
-    """A host with two agents is cut off from two other hosts in the middle of a swap, for 5 s."""
+    """A host with two agents is cut off from two other hosts in the middle of a swap, for 7 s."""
     cell = replace(GUARANTEED_SWAP, agents=6, delay_ms=20.0)
-    event = Split([frozenset({0, 1, 2, 3}), frozenset({4, 5})], 2.5, 5.0)
-    layout = replace(layout_of("swap", 1, 6), events=(event,), limit_s=9.0, lost=frozenset({4, 5}))
+    event = Split([frozenset({0, 1, 2, 3}), frozenset({4, 5})], 2.5, 7.0)
+    layout = replace(layout_of("swap", 1, 6), events=(event,), limit_s=11.0, lost=frozenset({4, 5}))
     flight = TrialFlight(Trial(cell, 1), layout)
     flight.run()
     return flight
@@ -160,7 +160,7 @@ def test_all_arrive_although_links_fail_for_seconds(relayed: bool, monkeypatch: 
 
 
 def cut_off_on_the_ground() -> tuple[bool, list[dict[str, Any]]]:
-    """Return whether four agents take off that do not hear the last of them for 5 s before, and who is excluded."""
+    """Return whether four agents take off that do not hear the last of them for 7 s before, and who is excluded."""
     sets = ("swarm.agents=4", "separation.mode=guaranteed", "mission.kind=swap", "agent.rate_hz=25")
     lockstep = Lockstep(load(None, sets))
     alone, others = agent_name(3), frozenset(map(agent_name, range(3)))
@@ -168,11 +168,11 @@ def cut_off_on_the_ground() -> tuple[bool, list[dict[str, Any]]]:
     def begun() -> bool:
         return all(log.rows and log.rows[-1]["phase"][0] == Phase.TRACK for log in lockstep.logs)
 
-    while not begun() and lockstep.clock.now_us() < 22_000_000:
+    while not begun() and lockstep.clock.now_us() < 24_000_000:
         lockstep.step()
         if lockstep.clock.now_us() == 2_400_000:  # all have seen their vehicles, and heard each other
             lockstep.hub.split([frozenset({alone}), others])
-        if lockstep.clock.now_us() == 7_400_000:
+        if lockstep.clock.now_us() == 9_400_000:
             lockstep.hub.heal()
     return begun(), [e for log in lockstep.logs for e in log.events if e["event"] == "membership" and e["excluded"]]
 

@@ -15,9 +15,9 @@ CONFIG, PUBLISHED = "improved_6_obstacle.toml", "thesis_6_obstacle.toml"
 
 
 @cache
-def with_published_weights(seed: int = 0) -> Flight:
+def with_published_weights() -> Flight:
     """Fly from the ground and back, past the obstacle twice."""
-    return fly_now(config=PUBLISHED, seed=seed)
+    return fly_now(config=PUBLISHED)
 
 
 def clearance_m(flight: Flight) -> float:
@@ -36,16 +36,24 @@ def test_all_keep_clear_of_the_obstacle_and_of_each_other(fly: Fly, seed: int) -
         assert past.modes(agent, Phase.TRACK) == {Mode.TRACKING}
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_with_published_weights_all_stay_off_the_obstacle_and_land(seed: int) -> None:
-    """Without a weight on velocity agents overshoot their keep-out of 1.75 m, and the safety filter acts.
+def check_published_weights(past: Flight) -> None:
+    """Check that without a weight on velocity, where agents overshoot their keep-out of 1.75 m, none touches.
 
-    The worst of six starts is 1.51 m; 1.24 m is where the airframe touches.
+    The safety filter acts. The worst of six starts is 1.51 m; 1.24 m is where the airframe touches.
     """
-    past = with_published_weights(seed)
-    assert past.problems == []
     assert clearance_m(past) >= 1.45
     assert past.separation_m() >= 0.85
+
+
+def test_with_published_weights_all_stay_off_the_obstacle_and_land() -> None:
+    past = with_published_weights()
+    assert past.problems == []
+    check_published_weights(past)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_with_published_weights_all_stay_off_the_obstacle_from_starts_a_millimetre_off(fly: Fly, seed: int) -> None:
+    check_published_weights(fly("sitl.start=air", config=PUBLISHED, until=mission_is_over, seed=seed))
 
 
 def test_the_obstacle_is_known_only_within_the_visibility_distance() -> None:

@@ -72,7 +72,7 @@ def test_four_agents_that_meet_keep_their_distance_from_every_start(fly: Fly, se
 @pytest.mark.usefixtures("configured_starts")
 def test_negative_control_without_room_for_those_who_come_closer_four_come_closer(fly: Fly) -> None:
     """From twelve starts they come to 0.81 to 0.90 m: each changes its plan while the others do."""
-    assert min(four_meet(fly, seed, "separation.approach_01=0").separation_m() for seed in range(4)) < 0.85
+    assert any(four_meet(fly, seed, "separation.approach_01=0").separation_m() < 0.85 for seed in range(4))
 
 
 @pytest.mark.usefixtures("configured_starts")

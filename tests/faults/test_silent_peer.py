@@ -47,4 +47,4 @@ def test_negative_control_those_who_make_room_for_all_it_may_do_come_too_close(
         return made(*values, **named)
 
     monkeypatch.setattr(world_model, "keep_out_along", driven)
-    assert min(apart_m(tmp_path, start) for start in range(1, 6)) < APART_M
+    assert any(apart_m(tmp_path, start) < APART_M for start in range(1, 6))
