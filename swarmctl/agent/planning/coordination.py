@@ -33,7 +33,7 @@ from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Phase, VehicleState
 
-_SUSPECT_US = 5_000_000  # without a message, after which a peer is suspected: bursts of loss on all its links end sooner
+_SUSPECT_US = 5_000_000  # without a message, after which a peer is suspected: bursts of loss end sooner
 _GAP_US = 1_000_000  # without a fresh state, after which nothing is committed any more
 _SAME_M = 1e-3  # tubes that differ by less are equal: messages round
 _CUT_OFF_US = 20_000_000  # at rest without the acknowledgements required, after which the agent lands where it is

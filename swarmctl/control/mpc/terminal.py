@@ -27,7 +27,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from swarmctl.core.types import Array
 
@@ -66,6 +65,8 @@ def terminal_region(
         daccel_max_m_s2: largest increment of the acceleration per step.
         dt_s: step.
     """
+    from scipy.linalg import solve_discrete_are  # imports for 0.15 s, needed only where plans are made
+
     a, b = transition(dt_s)
     p = solve_discrete_are(a, b, np.diag([q_pos, q_vel, 0.0]), np.array([[r]]))
     gain = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)[0]

@@ -1,4 +1,7 @@
-"""The QP solvers by the names that a configuration uses."""
+"""The QP solvers by the names that a configuration uses.
+
+Each is imported with the first solver of its kind: OSQP takes 0.2 s, and most processes only read a configuration.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.control.mpc.solvers.qp import QpParams, QpSolver
-from swarmctl.control.mpc.solvers.qp_osqp import OsqpSolver
 
 Mask = NDArray[np.bool_]
 
 
 def _daqp(hessian: Mask, rows: Mask, params: QpParams) -> QpSolver:
-    from swarmctl.control.mpc.solvers.qp_daqp import DaqpSolver  # an optional package
+    from swarmctl.control.mpc.solvers.qp_daqp import DaqpSolver
 
     return DaqpSolver(hessian, rows, params)
 
 
 def _osqp(hessian: Mask, rows: Mask, params: QpParams) -> QpSolver:
+    from swarmctl.control.mpc.solvers.qp_osqp import OsqpSolver
+
     retry = _daqp(hessian, rows, params) if params.retry_solver == "daqp" else None
     return OsqpSolver(hessian, rows, params, retry)
 
