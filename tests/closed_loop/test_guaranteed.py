@@ -10,6 +10,7 @@ import pytest
 from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.trials import Row, Trial
+from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.core.clock import ClockError
@@ -46,9 +47,19 @@ def test_negative_control_agents_that_give_way_only_after_standing_lock() -> Non
 
 
 def test_agents_fly_around_where_a_lost_peer_was_committed_to_end() -> None:
-    """If recovery did not see it, an agent would stand for good between that place and the lost peer's last path."""
-    flight = flown(replace(GUARANTEED_SWAP, scenario="death", agents=6, delay_ms=100.0), 3)
-    assert flight.row(None)["outcome"] == "arrived"
+    """If recovery did not see it, an agent would stand for good between that place and the lost peer's last path.
+
+    From one of six starts the lost peer, number 5, may stay 0.45 m from the goal of another, which waits beside it.
+    """
+    cell = replace(GUARANTEED_SWAP, scenario="death", agents=6, delay_ms=100.0)
+    flight = flown(cell, 3)
+    goals_ned_m = layout_of("death", 3, 6).goals_ned_m
+    witness = flight.lockstep.agents[0]
+    assert witness is not None and isinstance(witness._separation, Guaranteed) and goals_ned_m is not None
+    kept = witness._separation.coordination.lost_peer_keep_outs
+    free = [i for i in range(5) if all(keep_out.distance_m(goals_ned_m[i]) > keep_out.radius_m for keep_out in kept)]
+    assert len(free) >= 4
+    assert flight.monitor.arrived[free].all()
 
 
 def test_negative_control_agents_that_see_nobody_touch() -> None:

@@ -55,10 +55,11 @@ def test_separation_is_the_same_within_a_centimetre(osqp: Flight, daqp: Flight) 
     assert daqp.separation_m() >= 0.85
 
 
-def test_height_is_the_same_within_millimetres(osqp: Flight, daqp: Flight) -> None:
+def test_height_is_the_same_within_a_centimetre(osqp: Flight, daqp: Flight) -> None:
+    """It differs by 0.8 to 6.5 mm from six starts: agents that are elsewhere around the reference yield elsewhere."""
     heights = [flight.tracked(agent)[1][:, 2] for agent in range(3) for flight in (osqp, daqp)]
     for one, other in zip(heights[::2], heights[1::2], strict=True):
-        np.testing.assert_allclose(one, other, atol=0.005)  # measured 0.0008
+        np.testing.assert_allclose(one, other, atol=0.01)
 
 
 def test_positions_diverge_slowly(osqp: Flight, daqp: Flight) -> None:
