@@ -208,7 +208,7 @@ ROWS = (
         apart_m=0.75,
         off=FORGETS,
     ),
-    clock_steps(0.7, "clock-ahead", SWAP, ""),
+    clock_steps(3.0, "clock-ahead", SWAP, ""),
     clock_steps(-0.7, "clock-behind", SWAP, ""),
     clock_steps(0.7, "clock-ahead-guaranteed", GUARANTEED, ", with guaranteed separation"),
     clock_steps(-0.7, "clock-behind-guaranteed", GUARANTEED, ", with guaranteed separation"),
