@@ -9,6 +9,7 @@ python -m tests.faults --plays 10         again and again
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import tempfile
 import time
@@ -42,6 +43,7 @@ def main() -> int:
     if options.page:
         print(page(), end="")
         return 0
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under `nohup` launches would ignore a closed terminal
     chosen = [row for row in ROWS.values() if any(fnmatch(row.name, word) for word in options.only.split(","))]
     failed = 0
     for number in range(options.plays):
