@@ -18,7 +18,7 @@ from swarmctl.control.failsafe.decision import FailsafeParams
 from swarmctl.control.failsafe.overload import OverloadParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.phases.state_machine_params import StateMachineParams
-from swarmctl.control.reference.deadlock import DeadlockParams
+from swarmctl.control.reference.deadlock_params import DeadlockParams
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.params import Params

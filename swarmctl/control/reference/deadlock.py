@@ -18,19 +18,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import Field
 
 from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.reference.deadlock_params import DeadlockParams
+from swarmctl.control.reference.shortest_path import Polyline, shortest_path
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Sampled
-
-if TYPE_CHECKING:
-    from swarmctl.control.reference.shortest_path import Polyline
 
 _REPLAN_US = 500_000
 _REPLACE_01 = 0.85  # a new path replaces the old one when its length is below this share
@@ -39,17 +35,6 @@ _STANDING_M = 0.15  # a peer that moves less over its plan counts as standing
 _MARGIN_M = 0.02  # added to the distance at which corners are passed
 _GAP_PRICE = 3.0  # factor on the price of doubtful gaps at every escalation level
 _ACCEL_M_S2 = 0.8  # deceleration towards the end of a path
-
-
-class DeadlockParams(Params):
-    """Sets when an agent counts as deadlocked, and how it recovers."""
-
-    enabled: bool = True  # false: deadlocks are only reported
-    behind_m: float = Field(0.2, gt=0, le=100)  # an agent nearer to its reference has arrived
-    moved_m: float = Field(0.2, gt=0, le=10)  # an agent that moves less in `patience_s` makes no progress
-    patience_s: float = Field(1.5, gt=0.1, le=60)  # time without progress after which an agent counts as deadlocked
-    near_m: float = Field(0.4, gt=0, le=10)  # beyond the distance to keep; nearer keep-outs can block
-    speed_m_s: float = Field(1.0, gt=0, le=20)  # speed along the way round what blocks it
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,10 +96,6 @@ class DeadlockRecovery:
     """
 
     def __init__(self, params: DeadlockParams, agent: int, radius_m: float, volume: FlightVolume | None = None) -> None:
-        # 0.2 s for scipy's graphs: before a flight, and not where a configuration is only read
-        from swarmctl.control.reference.shortest_path import shortest_path
-
-        self._shortest_path = shortest_path
         self._sides = None if volume is None else volume.planned_sides
         self._params, self._agent, self._radius_m = params, agent, radius_m
         self._progress = ProgressMonitor(params)
@@ -202,7 +183,7 @@ class DeadlockRecovery:
         discs = self._discs(keep_outs, obstacles)
         start, goal = self._pos_ned_m[:2], self._goal_ned_m[:2]
         squeeze = _GAP_PRICE**self._escalation_level
-        path = self._shortest_path(start, goal, discs, self._radius_m / 3.0, squeeze=squeeze, sides=self._sides)
+        path = shortest_path(start, goal, discs, self._radius_m / 3.0, squeeze=squeeze, sides=self._sides)
         if not anew and self._path is not None and math.dist(self._path.corners[-1], goal) < self._params.behind_m:
             remainder = self._path.remainder(start)
             if remainder.is_clear(discs) and path.length_m > _REPLACE_01 * remainder.length_m:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.separation import KeepOut
-from swarmctl.control.reference.deadlock import DeadlockParams, DeadlockRecovery, ProgressMonitor
+from swarmctl.control.reference.deadlock import DeadlockRecovery, ProgressMonitor
+from swarmctl.control.reference.deadlock_params import DeadlockParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array
 from tests import builders
