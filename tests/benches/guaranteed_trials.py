@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.trials import Cell, Trial
@@ -14,8 +17,9 @@ GUARANTEED_SWAP = Cell(
 TUBE_M = 0.5 * (COMMITTED_M - TOUCH_M)
 
 
-def flown(cell: Cell, seed: int = 1) -> TrialFlight:
-    flight = TrialFlight(Trial(cell, seed), layout_of(cell.scenario, seed, cell.agents))
+def flown(cell: Cell, seed: int = 1, **changes: Any) -> TrialFlight:
+    """Fly the layout that the seed draws, with these changes of its fields."""
+    flight = TrialFlight(Trial(cell, seed), replace(layout_of(cell.scenario, seed, cell.agents), **changes))
     flight.run()
     return flight
 

@@ -9,8 +9,8 @@ import pytest
 
 from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight
-from sitl.studies.campaign.trials import Row, Trial
-from swarmctl.agent.planning.separation_policy import Guaranteed
+from sitl.studies.campaign.trials import Row
+from swarmctl.agent.planning.separation_policy import Guaranteed, SeparationDirective, SeparationInputs
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.core.clock import ClockError
@@ -29,11 +29,9 @@ PROMPT_S = 12.0  # of four trials: 8.1 to 9.9 s; agents that lock in the middle 
 
 
 def swap_of_six(traffic_rule: str = "", seed: int = 1) -> Row:
-    """Fly a swap whose plans are late, for as long as it may take."""
+    """Fly a swap whose plans are late, for `PROMPT_S` at most."""
     cell = replace(GUARANTEED_SWAP, agents=6, delay_ms=100.0, sets=traffic_rule)
-    flight = TrialFlight(Trial(cell, seed), replace(layout_of(cell.scenario, seed, cell.agents), limit_s=PROMPT_S))
-    flight.run()
-    return flight.row(None)
+    return flown(cell, seed, limit_s=PROMPT_S).row(None)
 
 
 def test_agents_that_meet_give_way_by_rule_before_all_stand() -> None:
@@ -49,13 +47,15 @@ def test_negative_control_agents_that_give_way_only_after_standing_lock() -> Non
     assert not row["arrived"]
 
 
+SWAP_WITH_A_DEATH = replace(GUARANTEED_SWAP, scenario="death", agents=6, delay_ms=100.0)
+
+
 def test_agents_fly_around_where_a_lost_peer_was_committed_to_end() -> None:
     """If recovery did not see it, an agent would stand for good between that place and the lost peer's last path.
 
     From one of six starts the lost peer, number 5, may stay 0.45 m from the goal of another, which waits beside it.
     """
-    cell = replace(GUARANTEED_SWAP, scenario="death", agents=6, delay_ms=100.0)
-    flight = flown(cell, 3)
+    flight = flown(SWAP_WITH_A_DEATH, 3)
     goals_ned_m = layout_of("death", 3, 6).goals_ned_m
     witness = flight.lockstep.agents[0]
     assert witness is not None and isinstance(witness._separation, Guaranteed) and goals_ned_m is not None
@@ -63,6 +63,21 @@ def test_agents_fly_around_where_a_lost_peer_was_committed_to_end() -> None:
     free = [i for i in range(5) if all(keep_out.distance_m(goals_ned_m[i]) > keep_out.radius_m for keep_out in kept)]
     assert len(free) >= 4
     assert flight.monitor.arrived[free].all()
+    assert not flight.monitor.collided
+
+
+@pytest.mark.usefixtures("configured_starts")
+def test_negative_control_an_agent_that_does_not_see_where_a_lost_peer_may_be_stands(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One of ten layouts shows it; who sees it arrives there in 19.4 s, from four of six shifted starts."""
+    step = Guaranteed.step
+
+    def without_lost_peers(self: Guaranteed, inputs: SeparationInputs) -> SeparationDirective:
+        return replace(step(self, inputs), lost_peer_keep_outs=())
+
+    monkeypatch.setattr(Guaranteed, "step", without_lost_peers)
+    assert not flown(SWAP_WITH_A_DEATH, 9, limit_s=20.5).row(None)["arrived"]
 
 
 def test_negative_control_agents_that_see_nobody_touch() -> None:
@@ -79,9 +94,7 @@ def flown_by_clocks(ahead_ms: Sequence[float], sets: str = "") -> TrialFlight:
         agent: ClockError(offset_us=round(1000 * ms), drift_ppm=200.0 * (-1) ** agent)
         for agent, ms in enumerate(ahead_ms)
     }
-    flight = TrialFlight(Trial(cell, 2), replace(layout_of("swap", 2, 4), clocks=clocks))
-    flight.run()
-    return flight
+    return flown(cell, 2, clocks=clocks)
 
 
 def test_agents_whose_clocks_differ_by_a_second_keep_apart() -> None:

@@ -21,7 +21,7 @@ from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.bus.bus import agent_name
 from swarmctl.config import load
 from swarmctl.core.types import Phase
-from tests.benches.guaranteed_trials import COMMITTED_M, GUARANTEED_SWAP, TOUCH_M, events
+from tests.benches.guaranteed_trials import COMMITTED_M, GUARANTEED_SWAP, TOUCH_M, events, flown
 
 
 def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
@@ -68,10 +68,7 @@ def test_negative_control_taking_stale_peers_for_lost_commits_against_alive_peer
 def disturbed(event: ScenarioEvent, lost: Set[int] = frozenset(), limit_s: float = 12.0) -> TrialFlight:
     """Four agents that swap; those in `lost` need not arrive, and nobody has to stay in the mission."""
     cell = replace(GUARANTEED_SWAP, delay_ms=50.0)
-    layout = replace(layout_of("swap", 1, 4), events=(event,), limit_s=limit_s, lost=frozenset(lost))
-    flight = TrialFlight(Trial(cell, 1), layout)
-    flight.run()
-    return flight
+    return flown(cell, events=(event,), limit_s=limit_s, lost=frozenset(lost))
 
 
 def halves(for_s: float = math.inf) -> Split:
@@ -102,10 +99,7 @@ def two_of_six_cut_off() -> TrialFlight:
     """A host with two agents is cut off from two other hosts in the middle of a swap, for 7 s."""
     cell = replace(GUARANTEED_SWAP, agents=6, delay_ms=20.0)
     event = Split([frozenset({0, 1, 2, 3}), frozenset({4, 5})], 2.5, 7.0)
-    layout = replace(layout_of("swap", 1, 6), events=(event,), limit_s=11.0, lost=frozenset({4, 5}))
-    flight = TrialFlight(Trial(cell, 1), layout)
-    flight.run()
-    return flight
+    return flown(cell, events=(event,), limit_s=11.0, lost=frozenset({4, 5}))
 
 
 def evasions(flight: TrialFlight) -> int:
