@@ -253,11 +253,6 @@ def _least_separation_m(folder: Path, hosts: Sequence[str]) -> tuple[float, list
     return round(least_m, 3), pair
 
 
-def _at(t_us: NDArray[np.float64], rows: NDArray[np.void]) -> NDArray[np.float64]:
-    """Return the true positions (T, 3) of a vehicle [m] at these times (T,)."""
-    return np.stack([np.interp(t_us, rows["t_us"], rows["pos_ned_m"][:, axis]) for axis in range(3)], axis=1)
-
-
 def _command_line(pid: int) -> str:
     with contextlib.suppress(OSError):
         return Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace")

@@ -144,6 +144,16 @@ ROWS = tuple(
             "negative_control_without_the_reaction_they_come_too_close",
         ),
         (
+            "all-stalled",
+            "the computer of all agents stands still for 0.24 s, every 2.7 s",
+            "they fly farther apart for half a minute",
+            2.7,
+            "stalls are remembered (agent.overload)",
+            "test_overload.py",
+            "agents_whose_computer_stands_still_again_and_again_fly_farther_apart",
+            "negative_control_without_remembering_stalls_they_come_closer",
+        ),
+        (
             "state-misdated",
             "states of another time come in the vehicle's name",
             "the flight is bit for bit what it was",

@@ -47,8 +47,9 @@ class DeadlineWatch:
         self._overload.update(now_us, missed)
         self._stops.update(now_us, missed, _SETPOINT_LOSS_S if loss_s is None else loss_s)
         level = self._overload.level
-        if level is not Level.NONE:
-            self._alerts.put("overload", self._overload.text(), now_us)
+        text = self._overload.text()
+        if text:
+            self._alerts.put("overload", text, now_us)
         if level is not before:
             self._note("overload", level=level.name, missed_01=round(self._overload.missed_01, 3))
 

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from swarmctl.core.params import Params
 
+_TOLD_MARGIN_M = 0.02  # a smaller growth of distances after a stall is not worth an alert
 _LOST_PART = 0.5  # of the time without setpoints that missed deadlines must explain
 _TOLD_WITHIN_US = 3_000_000  # a HEARTBEAT a second tells the mode, and some are lost
 
@@ -26,6 +27,9 @@ class OverloadParams(Params):
     hold_01: float = Field(0.4, gt=0, le=1)  # from this fraction on the agent comes to rest
     clear_01: float = Field(0.2, ge=0, le=1)  # below this fraction a resting agent continues
     land_after_s: float = Field(10.0, gt=0, le=600)  # longest hold for this reason; then land
+    stall_memory_s: float = Field(30.0, ge=0, le=3600)  # time for which distances stay grown after a stall
+    stall_accel_m_s2: float = Field(4.0, ge=0, le=50)  # growth a t^2 / 2 after a stall of t
+    stall_margin_max_m: float = Field(0.5, ge=0, le=10)  # largest such growth
 
 
 class Level(enum.IntEnum):
@@ -98,24 +102,41 @@ class Overload:
         self._params, self._period_us = params, period_us
         self._seen: deque[tuple[int, int]] = deque()  # time, deadlines missed so far
         self._holds_since_us: int | None = None
+        self._stalls: deque[tuple[int, int]] = deque()  # end, length; each shorter than the one before
         self.level, self.missed_01 = Level.NONE, 0.0
 
     @property
     def margin_m(self) -> float:
-        """Margin to add to every distance [m]: from 0 at `widen_01` linearly to `margin_max_m` at `hold_01`."""
+        """Margin to add to every distance [m]: for the fraction of missed deadlines, or for the longest stall."""
+        return max(self._missed_margin_m(), self._stall_margin_m())
+
+    def _missed_margin_m(self) -> float:
+        """Return 0 at `widen_01`, and linearly up to `margin_max_m` at `hold_01`."""
         p = self._params
         if self.level is Level.NONE:
             return 0.0
         excess_01 = (self.missed_01 - p.widen_01) / max(1e-9, p.hold_01 - p.widen_01)
         return p.margin_max_m * min(1.0, max(0.0, excess_01))
 
+    def _stall_margin_m(self) -> float:
+        """Return how far two vehicles that keep their attitudes come closer in a stall as long as the longest one."""
+        if not self._stalls:
+            return 0.0
+        stall_s = self._stalls[0][1] * 1e-6
+        return min(self._params.stall_margin_max_m, 0.5 * self._params.stall_accel_m_s2 * stall_s * stall_s)
+
     def text(self) -> str:
-        """Return the text of the alert."""
-        return f"overload: {100.0 * self.missed_01:.0f} % of deadlines missed"
+        """Return the text of the alert, "" without one."""
+        if self.level is not Level.NONE:
+            return f"overload: {100.0 * self.missed_01:.0f} % of deadlines missed"
+        if self._stall_margin_m() < _TOLD_MARGIN_M:
+            return ""
+        return f"overload: stood still for {self._stalls[0][1] * 1e-6:.1f} s"
 
     def update(self, now_us: int, missed: int) -> None:
         """Update with the number of deadlines missed so far at monotonic time `now_us`."""
         p = self._params
+        self._remember_stall(now_us)
         self._seen.append((now_us, missed))
         while len(self._seen) > 2 and now_us - self._seen[1][0] >= p.window_s * 1e6:
             self._seen.popleft()
@@ -131,3 +152,13 @@ class Overload:
         else:
             lands = now_us - self._holds_since_us > p.land_after_s * 1e6
             self.level = Level.LAND if lands else Level.HOLD
+
+    def _remember_stall(self, now_us: int) -> None:
+        """Note how long no tick has run until this one, and forget what is over for `stall_memory_s`."""
+        stalled_us = now_us - self._seen[-1][0] - self._period_us if self._seen else 0
+        if stalled_us >= self._period_us:
+            while self._stalls and self._stalls[-1][1] <= stalled_us:
+                self._stalls.pop()
+            self._stalls.append((now_us, stalled_us))
+        while self._stalls and now_us - self._stalls[0][0] > self._params.stall_memory_s * 1e6:
+            self._stalls.popleft()

@@ -49,8 +49,41 @@ def test_margin_grows_with_the_fraction_and_is_bounded() -> None:
     assert 0.02 < margins[1] < margins[2] < margins[3] == pytest.approx(0.2)
 
 
+def stalled(*stalls_s: float, then_s: float) -> Overload:
+    """Tick for a second before each stall, and for `then_s` after the last."""
+    overload, now_us, missed = Overload(OverloadParams(), PERIOD_US), 0, 0
+    for stall_s in stalls_s:
+        for _ in range(50):
+            overload.update(now_us, missed)
+            now_us += PERIOD_US
+        now_us, missed = now_us + round(stall_s * 1e6), missed + round(stall_s * 50)
+    for _ in range(round(then_s * 50)):
+        overload.update(now_us, missed)
+        now_us += PERIOD_US
+    return overload
+
+
+@pytest.mark.parametrize(
+    ("stalls_s", "then_s", "margin_m"),
+    [
+        ((0.3,), 0.02, 0.18),  # 4 m/s2 * (0.3 s)^2 / 2
+        ((0.3,), 29.0, 0.18),
+        ((0.3,), 31.0, 0.0),
+        ((0.3, 0.2), 28.5, 0.18),  # the older one is the longer one, and over for 29.7 s
+        ((0.3, 0.2), 29.5, 0.08),
+        ((0.2, 0.3), 0.02, 0.18),
+        ((2.0,), 5.0, 0.5),
+        ((), 5.0, 0.0),
+    ],
+)
+def test_stalls_are_remembered(stalls_s: tuple[float, ...], then_s: float, margin_m: float) -> None:
+    assert stalled(*stalls_s, then_s=then_s).margin_m == pytest.approx(margin_m, abs=1e-6)
+
+
 def test_the_cause_is_named() -> None:
     assert ran([(0.5, 5)]).text() == "overload: 50 % of deadlines missed"
+    assert stalled(0.3, then_s=5.0).text() == "overload: stood still for 0.3 s"
+    assert stalled(0.08, then_s=5.0).text() == ""
 
 
 def test_deadlines_missed_before_the_first_update_do_not_count() -> None:
