@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarmctl.bus.network.hosts import HostParams, ip_of
 from swarmctl.bus.network.identity_files import STATION
