@@ -71,6 +71,7 @@ class TelemetryParams(Params):
     enabled: bool = True
     port: int = Field(9877, ge=1, le=65535)  # loopback, not the default of rerun; the next free one if taken
     rate_hz: float = Field(10.0, gt=0, le=50)  # updates of the view per agent
+    history_mb: int = Field(32, ge=1, le=65536)  # for who opens the view late: three agents fill 20 MB a minute
 
 
 class LimitParams(Params):

@@ -136,6 +136,7 @@ def viewer_command(config: Config, context: RunContext, port: int, *, view: bool
     argv = _python("-m", "swarmctl.telemetry.view.viewer", "--run", context.run, "--bus", context.endpoint)
     argv += ("--flight", viewed_flight(config).model_dump_json(), "--run-dir", f"{context.directory}")
     argv += ("--port", f"{port}", "--rate-hz", f"{config.telemetry.rate_hz!r}", "--die-with-parent")
+    argv += ("--history-mb", f"{config.telemetry.history_mb}")
     argv += () if context.identity is None else ("--identity", context.identity.as_json())
     return Command(VIEWER, argv + (("--view",) if view else ()) + (("--web",) if web else ()))
 
@@ -185,6 +186,14 @@ class Child:
         with contextlib.suppress(psutil.Error):
             return bool(psutil.Process(self.pid).status() in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP))
         return False
+
+    def processor_s(self) -> float | None:
+        """Return the processor time that it has used, or None if it has ended or a debugger holds it."""
+        with contextlib.suppress(psutil.Error):
+            process = psutil.Process(self.pid)
+            used = process.cpu_times()
+            return None if process.status() == psutil.STATUS_TRACING_STOP else used.user + used.system
+        return None
 
     def signal(self, signum: int) -> None:
         """Send a signal, unless the process has ended."""

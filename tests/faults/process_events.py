@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import sys
 import threading
 import time
 
+from swarmctl.telemetry.recording.run_files import SUMMARY
 from tests.benches.launches import AIR, NEAR, TWO
 from tests.faults.launched import Bounded, Start
 from tests.faults.row import Off, require
@@ -18,6 +20,10 @@ from tests.process.test_launch import killed_part
 VIEWED = ("--agents", "2", "--no-view")
 
 ROUTER = "swarmctl.bus.network.router"
+MEETING = (  # of four in one point, with guaranteed separation; time for those who wait
+    *("configs/swap8.toml", "--agents", "4", "--duration", "25", "--no-view", "--set", "separation.mode=guaranteed"),
+    *("--set", "start.positions_ned_m=[[4,0,0],[0,4,0],[-4,0,0],[0,-4,0]]"),
+)
 SHORT, LONG = ("--duration", "8"), ("--duration", "120")
 
 
@@ -73,6 +79,22 @@ def agent_stopped_for_20_s(start: Start) -> None:
     require(code == 4, f"exit code {code}")
     require(launched.said("agent-1 has been silent"), "its silence is not said")
     require(launched.landed() == {0: True, 1: True}, "a vehicle has not landed")
+
+
+def agent_frozen_where_four_meet(start: Start) -> None:
+    """The others can't pass where it may be until somebody knows."""
+    launched = start(*MEETING)
+    launched.until_phase("TRACK", 4)
+    time.sleep(2.0)
+    launched.event()
+    os.kill(agent_pid(launched), signal.SIGSTOP)
+    launched.reacts("it is ended", lambda: launched.said("agent-1 has not run for"))
+    code = launched.end()
+    require(code == 4, f"exit code {code}")
+    require(launched.said("the vehicle of agent-1 is on the ground and disarmed"), "nobody recovered its vehicle")
+    goals = json.loads((launched.run_dir / SUMMARY).read_text())["goals"]["agents"]
+    arrived = [goal["id"] for goal in goals if goal["reached_at_s"] is not None]
+    require(arrived == [0, 2, 3], f"only these have arrived: {arrived}")
 
 
 def agent_killed(start: Start) -> None:

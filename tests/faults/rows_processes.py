@@ -5,6 +5,7 @@ from __future__ import annotations
 from tests.faults.launched import LaunchedRow
 from tests.faults.process_events import (
     ROUTER,
+    agent_frozen_where_four_meet,
     agent_killed,
     agent_starved,
     agent_stopped_briefly,
@@ -80,11 +81,20 @@ ROWS = (
     LaunchedRow(
         name="process-agent-stopped-20s",
         event="an agent's process is stopped, and stays so",
-        reaction="it is named and given up when the others have finished; its vehicle is landed",
+        reaction="it is named and not waited for; its vehicle is landed",
         within_s=90.0,
         protection="agents that are silent are not waited for",
         script=agent_stopped_for_20_s,
         off=in_program("launch", SUPERVISOR + "supervisor._SILENCE_S = 1e9"),
+    ),
+    LaunchedRow(
+        name="process-agent-frozen",
+        event="an agent's process is stopped for good where four meet, with guaranteed separation",
+        reaction="it is ended, and another process lands its vehicle; the others, who have waited, arrive",
+        within_s=15.0,
+        protection="who is silent and does not run is ended",
+        script=agent_frozen_where_four_meet,
+        off=in_program("launch", SUPERVISOR + "supervisor._STANDSTILL_S = 1e9"),
     ),
     LaunchedRow(
         name="process-agent-killed",

@@ -25,6 +25,7 @@ from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery
+from swarmctl.ops.supervision.standstill import Standstill
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
 from swarmctl.telemetry.recording.event_log import EventLog
@@ -36,6 +37,7 @@ _FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
 _VEHICLE_S = 90.0  # timeout for every agent to receive its vehicle
 _BEYOND_MISSION_S = 300.0  # for take-off, waiting and landing; a longer flight is ended
 _SILENCE_S = 5.0
+_STANDSTILL_S = 5.0  # of a silent agent, after which it is ended
 _PAUSE_S = 0.5  # of the supervisor
 _LAND_S = 60.0
 _LAND_REPEAT_S = 0.5
@@ -82,6 +84,7 @@ class FlightSupervisor:
         self._obstacles = ObstacleKeeper(self._bus, config.obstacles)
         self._report = BusReport(self._bus, services.log.write, display)
         self._hearing = Hearing(self._bus, self._announce)
+        self._standstill = Standstill()
         self._started_s = self._stepped_s = time.monotonic()
         self._mission_ends_s = self._started_s + config.mission.duration_s  # at the earliest
         self._reported: set[str] = set()
@@ -237,6 +240,7 @@ class FlightSupervisor:
                 self._fail(
                     "agent_unresponsive", f"{child.name} has been silent for {_SILENCE_S:.0f} s; the others fly on"
                 )
+            self._end_if_frozen(child, now_s)
         elif view.note:
             view.note = ""
             self._announce("agent_back", f"{child.name} responds again")
@@ -245,6 +249,12 @@ class FlightSupervisor:
             self._refuse(
                 f"{child.name} hears no vehicle at {url} after {_VEHICLE_S:.0f} s; check that it is on and sends"
             )
+
+    def _end_if_frozen(self, child: Child, now_s: float) -> None:
+        """End a silent agent that does not run, so that its vehicle is recovered and the others are told."""
+        if self._standstill.lasts_s(child, now_s) > _STANDSTILL_S and self._is_first(f"{child.name} frozen"):
+            self._fail("agent_frozen", f"{child.name} has not run for {_STANDSTILL_S:.0f} s, and was ended")
+            child.kill_all()
 
     def _watch_time(self) -> None:
         limit_s = self._mission_ends_s + _BEYOND_MISSION_S - self._started_s

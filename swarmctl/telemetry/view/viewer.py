@@ -29,7 +29,6 @@ from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_port
 from swarmctl.wall_clock import utc_us
 
 URL_FILE = "viewer.url"
-_SERVER_MEMORY = "512MiB"  # history for viewers that connect late
 _EXIT_TIMEOUT_S = 4.0  # longest time from SIGTERM to the exit, whatever hangs
 _FLUSH_TIMEOUT_S = 2.0
 _PAGE_LOOK_S = 0.2  # time between two looks whether the page is still served
@@ -66,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--run-dir", type=Path, required=True, help="folder for telemetry.rrd and viewer.url")
     parser.add_argument("--port", type=int, default=9876, help="loopback; the next free one when it is taken")
     parser.add_argument("--rate-hz", type=float, default=10.0, help="batches a second")
+    parser.add_argument("--history-mb", type=int, default=32, help="memory for who opens the view late")
     parser.add_argument("--view", action="store_true", help="open the native viewer when there is a display")
     parser.add_argument("--web", action="store_true", help="serve a page to browsers of this computer, too")
     parser.add_argument("--identity", metavar="JSON", help="as which it listens on a bus of several computers")
@@ -99,7 +99,7 @@ def _run(options: argparse.Namespace, flight: ViewedFlight, stop: StopRequest) -
     bus = _interruptible(join, stop)
     if bus is None:
         return EXIT_OK
-    rec, url = _serve(options.run, options.run_dir, options.port)
+    rec, url = _serve(options.run, options.run_dir, options.port, options.history_mb)
     scene = Scene(rec, flight)
     scene.begin()
     feed = Feed(bus, agents)
@@ -175,7 +175,7 @@ def _interruptible(connect: Callable[[], Any], stop: StopRequest) -> Any:
     return answer[0]
 
 
-def _serve(run: str, directory: Path, port: int) -> tuple[Any, str]:
+def _serve(run: str, directory: Path, port: int, history_mb: int) -> tuple[Any, str]:
     """Return a stream that serves on loopback and, if the disk allows, writes the recording; and its URL."""
     import rerun as rr
 
@@ -184,7 +184,7 @@ def _serve(run: str, directory: Path, port: int) -> tuple[Any, str]:
     path = directory / RECORDING
     writable = _takes_data(path)
     for candidate in free_view_ports(port):
-        server = rr.GrpcServerSink(HOST, candidate, server_memory_limit=_SERVER_MEMORY, newest_first=True)
+        server = rr.GrpcServerSink(HOST, candidate, server_memory_limit=f"{history_mb}MB", newest_first=True)
         rec.set_sinks(server, *([rr.FileSink(str(path), write_footer=False)] if writable else []))
         if _is_ours(candidate):
             return rec, f"rerun+http://{HOST}:{candidate}/proxy"
