@@ -141,6 +141,21 @@ def test_the_others_go_on_without_a_frozen_agent_once_they_agree() -> None:
     assert all(e["excluded"] == [3] for e in excluded)
 
 
+@pytest.mark.parametrize("landed", [True, False], ids=["", "control: nobody lands its vehicle"])
+def test_the_others_arrive_once_the_vehicle_of_a_frozen_agent_has_landed(landed: bool) -> None:
+    """Its host's supervisor has another process land it, which tells where it is.
+
+    Of ten draws all arrive with it, and four without it.
+    """
+    cell = replace(GUARANTEED_SWAP, disturbance="freeze")
+    layout = drawn(cell, 10)
+    frozen, recovery = layout.events
+    flight = TrialFlight(Trial(cell, 10), replace(layout, events=(frozen, recovery)[: 1 + landed], limit_s=18.0))
+    flight.run()
+    assert flight.monitor.min_separation_m >= TOUCH_M
+    assert flight.row(None)["arrived"] is landed
+
+
 @pytest.mark.parametrize("relayed", [True, False], ids=["", "control: nobody relays"])
 def test_all_arrive_although_links_fail_for_seconds(relayed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each direction between two agents delivers nothing for two fifths of the time, 2 s at once."""

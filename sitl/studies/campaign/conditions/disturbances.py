@@ -13,7 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sitl.studies.campaign.conditions.events import Freeze, OneWayCut, ScenarioEvent, SimulatorFault, Split
+from sitl.studies.campaign.conditions.events import (
+    Freeze,
+    OneWayCut,
+    Recovery,
+    ScenarioEvent,
+    SimulatorFault,
+    Split,
+)
 from sitl.studies.campaign.conditions.scenarios import Layout
 from swarmctl.core.clock import ClockError
 from swarmctl.simulator_config import FaultParams
@@ -24,6 +31,7 @@ _BEGINS_S = (0.3, 4.0)  # mission time at which most of them begin: on the way t
 _LASTS_S = (1.0, 8.0)
 _GUST_S = (1.0, 4.0)
 _DRIFT_PPM = 200.0
+_ENDED_AFTER_S = 10.0  # `swarmctl.ops.supervision.supervisor`: named after 5 s of silence, ended after 5 s more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,9 +84,12 @@ def _jitter(rng: np.random.Generator, layout: Layout, jitter_ms: float) -> Layou
 
 
 def _freeze(rng: np.random.Generator, layout: Layout, for_s: float) -> Layout:
-    victim = int(rng.integers(layout.agents))
-    lost = {victim} if math.isinf(for_s) else ()
-    return _with(layout, [Freeze(victim, float(rng.uniform(*_BEGINS_S)), for_s)], lost=lost)
+    """Stop a process; one that stays so is ended by its host's supervisor, which has another land the vehicle."""
+    victim, at_s = int(rng.integers(layout.agents)), float(rng.uniform(*_BEGINS_S))
+    if for_s <= _ENDED_AFTER_S:
+        return _with(layout, [Freeze(victim, at_s, for_s)])
+    events = [Freeze(victim, at_s, math.inf), Recovery(victim, at_s + _ENDED_AFTER_S)]
+    return _with(_set(layout, "sitl.start=ground"), events, lost={victim})  # where it lands
 
 
 def _steps(rng: np.random.Generator, layout: Layout, wind_m_s: float) -> Layout:

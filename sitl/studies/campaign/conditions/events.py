@@ -120,6 +120,20 @@ class Freeze(_Episode):
         lockstep.frozen.discard(self._agent)
 
 
+class Recovery(_Episode):
+    """The supervisor of an agent's host ends its process, and another one lands its vehicle."""
+
+    def __init__(self, agent: int, at_s: float) -> None:
+        super().__init__(at_s, math.inf)
+        self._agent = agent
+
+    def _begin(self, lockstep: Lockstep) -> None:
+        lockstep.recover(self._agent)
+
+    def _end(self, lockstep: Lockstep) -> None:
+        return
+
+
 class SimulatorFault(_Episode):
     """A fault of the simulator, of the kinds in `swarmctl.simulator_config.FAULTS`; its `at_s` is not used."""
 
