@@ -163,11 +163,12 @@ def _reported_positions(rows: NDArray[np.void], time_field: str, at_us: NDArray[
 
 
 def unseen_spans(rows: NDArray[np.void], time_field: str) -> list[tuple[float, float]]:
-    """Return begin and end of every interval in which an armed vehicle's position was stale or unknown."""
+    """Return the intervals in which an armed vehicle's position was stale or unknown, from known to known position."""
     unseen = (rows["armed"] != 0) & ~(_located(rows) & (rows["state_age_ms"] <= _STALE_MS))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], unseen, [False]])))
     t_us = rows[time_field].astype(np.float64)
-    return [(float(t_us[first]), float(t_us[end - 1])) for first, end in edges.reshape(-1, 2)]
+    last = len(rows) - 1
+    return [(float(t_us[max(0, first - 1)]), float(t_us[min(last, end)])) for first, end in edges.reshape(-1, 2)]
 
 
 def interpolate(at_us: NDArray[np.int64], t_us: NDArray[np.int64], values: Array, gap_us: int) -> Array:

@@ -326,6 +326,14 @@ def vanishing(heard: bool) -> RunData:
     return run({0: seen, 1: passing})
 
 
+def test_a_vehicle_counts_as_unseen_from_its_last_known_position_to_the_next() -> None:
+    """One tick after a stall of 0.36 s knows no position, and lasts no time itself."""
+    stalled = np.delete(ticks(20, (0.0, 0.0, 0.0)), slice(500, 517))
+    stalled["pos_ned_m"][500] = math.nan
+    unseen = evaluate(run({0: stalled}), Rules(agents=1, required_separation_m=0.85), "failed")["violations"]
+    assert "agent 0 did not know where its armed vehicle was for 0.4 s, from 10.0 s on" in unseen[0]
+
+
 def test_a_vanished_vehicle_is_named_and_not_judged_by_its_last_position() -> None:
     summary = evaluate(vanishing(heard=False), Rules(agents=2, required_separation_m=0.85), "failed")
     assert summary["separation"]["min_m"] == pytest.approx(5.4)  # at 5 s, the last that is known
