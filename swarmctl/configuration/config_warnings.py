@@ -12,6 +12,7 @@ from swarmctl.core.text import point_text
 
 _BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
 _AGENTS_SHOWN = 3
+_SAME_M = 1e-6
 _ZERO = np.zeros(1)
 
 
@@ -20,7 +21,7 @@ def config_warnings(config: Config) -> list[str]:
     unused = config.mission.unused_sections()
     kind = config.mission.kind
     found = [f"mission.{name} is set, mission.kind is {kind!r}: it is not flown" for name in unused]
-    return [*found, *_begin_elsewhere(config)]
+    return [*found, *_begin_elsewhere(config), *_judged_by_more_than_is_kept(config)]
 
 
 def warning_lines(config: Config) -> list[str]:
@@ -47,3 +48,12 @@ def _begin_elsewhere(config: Config) -> Iterator[str]:
     yield from (f"{text}{hint}" for text in found[:_AGENTS_SHOWN])
     if len(found) > _AGENTS_SHOWN:
         yield f"{len(found) - _AGENTS_SHOWN} more references begin away from the agents' starts"
+
+
+def _judged_by_more_than_is_kept(config: Config) -> Iterator[str]:
+    """Yield that commitments keep less than the flight is judged by."""
+    budget, limit_m = config.separation.budget, config.limits.min_separation_m
+    if config.separation.mode == "guaranteed" and budget.committed_m < limit_m - _SAME_M:
+        keeps = f"separation.radius_m = {budget.radius_m:g}: commitments keep {budget.committed_m:.2f} m"
+        fails = f"the flight fails below limits.min_separation_m = {limit_m:g}"
+        yield f"{keeps}, and {fails}; {budget.radius_that_commits_m(limit_m):.2f} m keeps that"

@@ -78,6 +78,11 @@ class SeparationBudget:
         slack_m = min(self.certify_slack_m, _MAX_SLACK_01 * max(0.0, self.radius_m - self.body_m))
         return self.radius_m - slack_m
 
+    def radius_that_commits_m(self, committed_m: float) -> float:
+        """Return the least `radius_m` by which two committed trajectories keep `committed_m`."""
+        by_part_m = (committed_m - _MAX_SLACK_01 * self.body_m) / (1.0 - _MAX_SLACK_01)
+        return min(committed_m + self.certify_slack_m, by_part_m)
+
     @property
     def tube_m(self) -> float:
         """Return how far two vehicles may both be off their committed trajectories without touching."""

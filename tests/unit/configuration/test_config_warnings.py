@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,22 @@ def test_the_section_of_a_kind_that_is_not_flown_is_named() -> None:
     assert warning_lines(load(None, ["mission.kind=circle", GOALS])) == [f"warning: {said}"]
     assert "mission.own is set" in lines("mission.kind=hover", "mission.own.a=1")[0]
     assert len(lines("mission.kind=hover", GOALS, "mission.circle.radius_m=3")) == 2
+
+
+def test_commitments_that_keep_less_than_the_flight_is_judged_by_are_named() -> None:
+    guaranteed = "separation.mode=guaranteed"
+    (said,) = lines(guaranteed)
+    assert said.startswith("separation.radius_m = 0.9: commitments keep 0.80 m, and the flight fails below")
+    assert said.endswith("limits.min_separation_m = 0.85; 0.95 m keeps that")
+    assert lines(guaranteed, "separation.radius_m=0.95") == lines(guaranteed, "limits.min_separation_m=0.8") == []
+
+
+@pytest.mark.parametrize("limit_m", [0.52, 0.6, 0.85, 1.5])
+def test_the_radius_named_is_the_least_that_keeps_it(limit_m: float) -> None:
+    budget = load(None).separation.budget
+    radius_m = budget.radius_that_commits_m(limit_m)
+    assert replace(budget, radius_m=radius_m).committed_m == pytest.approx(limit_m)
+    assert replace(budget, radius_m=radius_m - 0.01).committed_m < limit_m
 
 
 def test_without_any_kind_it_is_refused() -> None:
