@@ -133,10 +133,16 @@ class Overload:
             return ""
         return f"overload: stood still for {self._stalls[0][1] * 1e-6:.1f} s"
 
-    def update(self, now_us: int, missed: int) -> None:
-        """Update with the number of deadlines missed so far at monotonic time `now_us`."""
+    def update(self, now_us: int, missed: int, *, flew: bool = True) -> None:
+        """Begin a tick.
+
+        Args:
+            now_us: monotonic time.
+            missed: deadlines missed so far.
+            flew: a setpoint has left in the tick before; a stall while the autopilot flies moves nobody.
+        """
         p = self._params
-        self._remember_stall(now_us)
+        self._remember_stall(now_us, flew)
         self._seen.append((now_us, missed))
         while len(self._seen) > 2 and now_us - self._seen[1][0] >= p.window_s * 1e6:
             self._seen.popleft()
@@ -153,10 +159,10 @@ class Overload:
             lands = now_us - self._holds_since_us > p.land_after_s * 1e6
             self.level = Level.LAND if lands else Level.HOLD
 
-    def _remember_stall(self, now_us: int) -> None:
+    def _remember_stall(self, now_us: int, flew: bool) -> None:
         """Note how long no tick has run until this one, and forget what is over for `stall_memory_s`."""
         stalled_us = now_us - self._seen[-1][0] - self._period_us if self._seen else 0
-        if stalled_us >= self._period_us:
+        if flew and stalled_us >= self._period_us:
             while self._stalls and self._stalls[-1][1] <= stalled_us:
                 self._stalls.pop()
             self._stalls.append((now_us, stalled_us))

@@ -49,18 +49,22 @@ def test_margin_grows_with_the_fraction_and_is_bounded() -> None:
     assert 0.02 < margins[1] < margins[2] < margins[3] == pytest.approx(0.2)
 
 
-def stalled(*stalls_s: float, then_s: float) -> Overload:
+def stalled(*stalls_s: float, then_s: float, flew: bool = True) -> Overload:
     """Tick for a second before each stall, and for `then_s` after the last."""
     overload, now_us, missed = Overload(OverloadParams(), PERIOD_US), 0, 0
     for stall_s in stalls_s:
         for _ in range(50):
-            overload.update(now_us, missed)
+            overload.update(now_us, missed, flew=flew)
             now_us += PERIOD_US
         now_us, missed = now_us + round(stall_s * 1e6), missed + round(stall_s * 50)
     for _ in range(round(then_s * 50)):
-        overload.update(now_us, missed)
+        overload.update(now_us, missed, flew=flew)
         now_us += PERIOD_US
     return overload
+
+
+def test_a_stall_while_the_autopilot_flies_is_not_remembered() -> None:
+    assert stalled(0.3, then_s=5.0, flew=False).margin_m == 0.0
 
 
 @pytest.mark.parametrize(
