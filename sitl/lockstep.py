@@ -31,7 +31,7 @@ from swarmctl.bus.relay import RelayingBus
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import EXCLUDE, Order
+from swarmctl.core.operator_verbs import EXCLUDE
 from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows
 from swarmctl.core.types import Plan
 from swarmctl.kernels import why_not_repeatable
@@ -140,7 +140,6 @@ class Lockstep:
         self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
         self.starved: dict[int, int] = {}  # agent -> its processor executes one tick out of this many
-        self._landing: set[int] = set()  # agents that only land their vehicles, and have not begun
         self._missed = [0] * agents
         self._steps = 0
         self._order = list(order) if order is not None else list(range(agents))
@@ -183,8 +182,6 @@ class Lockstep:
             if self._steps % self.starved.get(i, 1):
                 self._missed[i] += 1
                 continue
-            if i in self._landing and not agent.ask(Order("land"), now_us):
-                self._landing.discard(i)
             agent.tick(now_us, self._missed[i])
         self._steps += 1
         for _ in range(self._tick_us // self._physics_us):
@@ -203,8 +200,8 @@ class Lockstep:
         """End an agent's process and start another that only lands its vehicle, as a launch does with a frozen one."""
         self.kill(index)
         self.frozen.discard(index)
-        self._landing.add(index)
         self.agents[index] = self._agent(index, self.links[index][0], starts=1)
+        self.command("land", index)
 
     def command(self, verb: str, agent: int = -1, **arguments: float) -> None:
         """Send an operator's order, as a verb does."""

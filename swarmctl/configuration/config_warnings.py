@@ -12,7 +12,7 @@ from swarmctl.core.text import point_text
 
 _BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
 _AGENTS_SHOWN = 3
-_SAME_M = 1e-6
+_SAME_M = 1e-6  # distances that differ by less are the same but for rounding
 _ZERO = np.zeros(1)
 
 

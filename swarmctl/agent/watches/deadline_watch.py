@@ -24,7 +24,6 @@ class DeadlineWatch:
         period_us = round(1e6 / rate_hz)
         self._overload, self._stops = Overload(params, period_us), SetpointStops(period_us)
         self._alerts, self._note = alerts, note
-        self._has_sent = False  # a setpoint, in the newest tick
 
     @property
     def level(self) -> Level:
@@ -45,8 +44,7 @@ class DeadlineWatch:
             loss_s: time without setpoints after which the autopilot takes over; None until it has told.
         """
         before = self._overload.level
-        self._overload.update(now_us, missed, flew=self._has_sent)
-        self._has_sent = False
+        self._overload.update(now_us, missed, flew=self._stops.has_sent)
         self._stops.update(now_us, missed, _SETPOINT_LOSS_S if loss_s is None else loss_s)
         level = self._overload.level
         text = self._overload.text()
@@ -57,7 +55,6 @@ class DeadlineWatch:
 
     def sent(self, now_us: int) -> None:
         """Note that a setpoint has left in this tick."""
-        self._has_sent = True
         self._stops.sent(now_us)
 
     def stop_cause(self, now_us: int) -> str:

@@ -19,7 +19,7 @@ _TOLD_WITHIN_US = 3_000_000  # a HEARTBEAT a second tells the mode, and some are
 
 
 class OverloadParams(Params):
-    """Thresholds on the fraction of deadlines missed within `window_s`."""
+    """Thresholds on the fraction of deadlines missed within `window_s`, and what follows from stalls."""
 
     window_s: float = Field(2.0, gt=0, le=60)  # time over which missed deadlines are counted
     widen_01: float = Field(0.15, gt=0, le=1)  # above this fraction distances grow
@@ -57,6 +57,11 @@ class SetpointStops:
         self._sent_us: int | None = None
         self._missed = self._missed_at_sent = 0
         self._text, self._until_us = "", 0
+
+    @property
+    def has_sent(self) -> bool:
+        """Return whether a setpoint has left in the newest tick."""
+        return self._sent_us is not None and self._sent_us == self._ticked_us
 
     def update(self, now_us: int, missed: int, loss_s: float) -> None:
         """Begin a tick.
@@ -120,10 +125,12 @@ class Overload:
 
     def _stall_margin_m(self) -> float:
         """Return how far two vehicles that keep their attitudes come closer in a stall as long as the longest one."""
-        if not self._stalls:
-            return 0.0
-        stall_s = self._stalls[0][1] * 1e-6
-        return min(self._params.stall_margin_max_m, 0.5 * self._params.stall_accel_m_s2 * stall_s * stall_s)
+        p, stall_s = self._params, self._longest_stall_s
+        return min(p.stall_margin_max_m, 0.5 * p.stall_accel_m_s2 * stall_s * stall_s)
+
+    @property
+    def _longest_stall_s(self) -> float:
+        return self._stalls[0][1] * 1e-6 if self._stalls else 0.0
 
     def text(self) -> str:
         """Return the text of the alert, "" without one."""
@@ -131,7 +138,7 @@ class Overload:
             return f"overload: {100.0 * self.missed_01:.0f} % of deadlines missed"
         if self._stall_margin_m() < _TOLD_MARGIN_M:
             return ""
-        return f"overload: stood still for {self._stalls[0][1] * 1e-6:.1f} s"
+        return f"overload: stood still for {self._longest_stall_s:.1f} s"
 
     def update(self, now_us: int, missed: int, *, flew: bool = True) -> None:
         """Begin a tick.

@@ -14,6 +14,12 @@ from swarmctl.ops.supervision.standstill import Standstill
 BUSY = "import time\nwhile True:\n    time.sleep(0.002)\n    sum(range(20000))"
 
 
+def wait_until_it_runs(child: Child) -> None:
+    used_s = child.processor_s()
+    while child.processor_s() == used_s:
+        time.sleep(0.02)
+
+
 def looked(standstill: Standstill, child: Child, seconds: float) -> float:
     """Look every 50 ms, as the supervisor does; return the newest answer."""
     until_s, lasts_s = time.monotonic() + seconds, 0.0
@@ -26,15 +32,11 @@ def looked(standstill: Standstill, child: Child, seconds: float) -> float:
 def test_a_process_stands_still_while_it_is_stopped(tmp_path: Path) -> None:
     standstill, child = Standstill(), Child(Command("busy", (sys.executable, "-Sc", BUSY)), tmp_path)
     try:
-        used_s = child.processor_s()
-        while child.processor_s() == used_s:
-            time.sleep(0.02)
+        wait_until_it_runs(child)
         os.kill(child.pid, signal.SIGSTOP)
         assert looked(standstill, child, 1.5) > 1.0
         os.kill(child.pid, signal.SIGCONT)
-        used_s = child.processor_s()
-        while child.processor_s() == used_s:
-            time.sleep(0.02)
+        wait_until_it_runs(child)
         assert standstill.lasts_s(child, time.monotonic()) == 0.0
     finally:
         child.kill_all()
