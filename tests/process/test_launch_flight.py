@@ -353,6 +353,20 @@ def test_without_its_viewer_the_flight_goes_on(tmp_path: Path, signum: signal.Si
     assert sum("the flight goes on" in line for line in scene.said) == 1
 
 
+def test_an_interrupt_lands_those_that_fly_on_after_an_operator_has_landed_one(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [ends(130), FLIES_LONG])
+    scene.act = lambda: setattr(scene, "interrupts", int(scene.children["agent-0"].poll() is not None))
+    result = scene.fly()
+    assert (result.outcome, result.problems) == ("interrupted", [])
+    assert "land" in scene.orders
+
+
+def test_what_failed_is_not_hidden_by_an_operator_who_landed_the_rest(tmp_path: Path) -> None:
+    result = ScriptedServices(tmp_path, [ends(130), ends(EXIT_MISSION), ends(0)]).fly()
+    assert (result.outcome, len(result.problems)) == ("failed", 1)
+    assert result.exit_code(violated=False) == EXIT_MISSION
+
+
 def test_landed_by_an_operator_is_an_interrupted_flight(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [ends(130), ends(130)])
     result = scene.fly()

@@ -68,8 +68,12 @@ def run_station(config: Config, options: LaunchOptions) -> int:
                 time.sleep(_STEP_S)
             watch.close()
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
-    interrupted = bool(stop.count) or watch.was_stopped
-    result = LaunchResult(problems=watch.problems, interrupted=interrupted, has_armed=True)
+    result = LaunchResult(
+        problems=watch.problems,
+        interrupted=bool(stop.count),
+        landed_by_operator=watch.was_stopped,
+        has_armed=True,
+    )
     return judged(config, services, result)
 
 

@@ -15,14 +15,17 @@ class LaunchResult:
     could_not_start: bool = False
     has_armed: bool = False  # an agent has requested arming
     left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
-    interrupted: bool = False
+    interrupted: bool = False  # a stop request, such as Ctrl-C, has landed all
+    landed_by_operator: bool = False  # an order to land has ended the mission of an agent
 
     @property
     def outcome(self) -> str:
         """Outcome as in summary.json."""
         if self.interrupted:
             return "interrupted"
-        return "failed" if self.problems else "completed"
+        if self.problems:
+            return "failed"
+        return "interrupted" if self.landed_by_operator else "completed"
 
     def exit_code(self, violated: bool) -> int:
         """Return the exit code of the launch; `violated`: the referee found a violation."""
@@ -32,6 +35,8 @@ class LaunchResult:
             return EXIT_INTERRUPTED
         if self.could_not_start and not self.has_armed:
             return EXIT_START
+        if self.landed_by_operator and not self.problems:
+            return EXIT_INTERRUPTED
         return EXIT_MISSION if self.problems or violated else EXIT_OK
 
 

@@ -315,7 +315,7 @@ class FlightSupervisor:
         if code == EXIT_OK or self._essential_lost or self._recovery.is_on(view.agent):
             return
         if code == EXIT_INTERRUPTED:
-            self._result.interrupted |= self._land_ordered_s is None  # ended by an operator's `land`
+            self._result.landed_by_operator |= self._land_ordered_s is None
         elif code == EXIT_START:
             self._refuse(f"{child.name} could not start: {child.last_line()}")
         elif code == EXIT_MISSION:
