@@ -27,12 +27,14 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Answer, Order
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
-from swarmctl.core.types import Array, Mode, Phase
+from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase
 
 _COMPANY_US = 10_000_000  # a peer whose last status is older has left
 _RECENT_PATH_US = 300_000  # largest age of a path that is compared with commitments
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 _STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
+_DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
+_MOVES = frozenset(FlightMode) - {FlightMode.HOLD}
 FLOWN_BY_AGENT = frozenset((Mode.TRACKING, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
 
@@ -199,8 +201,8 @@ class WorldModel:
                 t0_utc_us,
                 params,
                 budget,
-                parked=self._is_in(path.agent, Phase.DONE),
-                landing=descends or self._is_in(path.agent, Phase.LAND),
+                parked=self._is_parked(path.agent),
+                landing=descends or self._is_landing(path.agent),
                 here_ned_m=pos_ned_m,
             )
             for path, points in zip(paths, () if places is None else places, strict=True)
@@ -265,7 +267,7 @@ class WorldModel:
                 continue
             filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
             age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
-            age_margin_m = budget.age_margin_m(age_s, parked=self._is_in(path.agent, Phase.DONE))
+            age_margin_m = budget.age_margin_m(age_s, parked=self._is_parked(path.agent))
             apart_m = budget.barrier_peer_m(margin_m, path.margin_m, age_margin_m)
             found.append(
                 body_of_peer(path, act_utc_us, ahead_s, apart_m, filters=filters, brake_m_s2=self._params.brake_m_s2)
@@ -281,8 +283,8 @@ class WorldModel:
     def has_ended(self, agent: int) -> bool:
         """Return whether there is evidence that a peer commits to nothing more.
 
-        Somebody vouches for the end of its process, or its vehicle was heard landed and disarmed. A missing liveliness
-        token is none: the peer may be cut off.
+        Somebody vouches for the end of its process, or it was heard done, and sends nothing to its vehicle any more. A
+        missing liveliness token is none: the peer may be cut off.
         """
         vouched = agent in self._vouched and self._vouched[agent] == self._boot_id(agent)
         return vouched or self._is_in(agent, Phase.DONE)
@@ -356,3 +358,21 @@ class WorldModel:
         """Return whether a peer has said that it is in a phase."""
         status = self._status.get(agent)
         return status is not None and status.phase == phase
+
+    def _is_parked(self, agent: int) -> bool:
+        """Return whether a peer's mission has ended and its vehicle stays where it is: on the ground, or in a hold.
+
+        An agent that was restarted in flight is done at once, while the autopilot still lands its vehicle.
+        """
+        stays = not self._flies_in(agent, _MOVES)
+        return self._is_in(agent, Phase.DONE) and stays
+
+    def _is_landing(self, agent: int) -> bool:
+        """Return whether a peer's vehicle descends, by its agent's order, a pilot's, or by itself."""
+        return self._is_in(agent, Phase.LAND) or self._flies_in(agent, _DESCENDS)
+
+    def _flies_in(self, agent: int, modes: Set[FlightMode]) -> bool:
+        """Return whether a peer's vehicle flies in one of these modes, as far as its agent has heard."""
+        status = self._status.get(agent)
+        flies = status is not None and status.armed and status.landed != Landed.ON_GROUND
+        return flies and status is not None and status.flight_mode in modes

@@ -32,6 +32,7 @@ class PathPublisher:
     ) -> None:
         self._setup, self._ports, self._delay_us = setup, ports, delay_us
         self._dt_us, self._steps, self._widens_in_gusts = controller.dt_us, controller.steps, widens_in_gusts
+        self._max_age_us = round(setup.params.failsafe.state_max_age_s * 1e6)
         self._sharing = PathSharing(setup.params.path_sharing, setup.separation)
         self._gust = GustWatch()
         self._far_due_us = 0  # when the next path is one that all hear
@@ -45,7 +46,7 @@ class PathPublisher:
         disturbance_ned_m_s2: Array,
         margins_m: Iterable[float],
     ) -> None:
-        """Publish the path of this tick, if peers need it and the vehicle has a state.
+        """Publish the path of this tick, if peers need it and it is known where the vehicle is.
 
         Args:
             state: newest state.
@@ -58,7 +59,7 @@ class PathPublisher:
             self._gust.forget()
         else:
             self._gust.update(self._ports.clock.now_us(), disturbance_ned_m_s2)
-        if state is None:
+        if state is None or not (flown is not None or self._is_recent(state)):
             return
         margin_m = min(MAX_MARGIN_M, sum((*margins_m, self._gust.margin_m)))
         topic = self._topic()
@@ -66,6 +67,10 @@ class PathPublisher:
         if path is not None:
             compact = topic is topics.FAR_PATH or self._setup.params.path_sharing.compact
             self._ports.bus.publish(topic, encode_path(path, compact=compact))
+
+    def _is_recent(self, state: VehicleState) -> bool:
+        """Return whether a state may be continued: peers could not tell that a path from it is older than it says."""
+        return self._ports.clock.now_us() - state.t_us <= self._max_age_us
 
     def _topic(self) -> topics.Topic:
         """Return the topic of this tick's path: that of peers within reach, or at times that of all."""
