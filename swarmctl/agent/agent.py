@@ -187,7 +187,7 @@ class Agent:
         self._deadlines.update(now_us, deadline_misses, self._ports.autopilot.setpoint_loss_s)
         self._receive(now_us)
         state = self._sense(now_us)
-        self._state_machine.begin_if_due(now_us, self._ports.utc_of_us(now_us))
+        self._state_machine.begin_if_due(now_us, self._ports.utc_of_us(now_us), state)
         sensed_ns = stopwatch_ns()
         planning = self._planner.plan(now_us, state)
         planned_ns = stopwatch_ns()

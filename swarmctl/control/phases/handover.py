@@ -26,15 +26,16 @@ def request_control(mission: MissionState, inputs: PhaseInputs, state: VehicleSt
 
 
 def take_control(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> None:
-    """Note that the autopilot follows our setpoints, and go to the start if that is next."""
+    """Note that the autopilot follows our setpoints, and go on from where the vehicle has been left."""
     if mission.had_control:
         return
     mission.had_control = True
-    if mission.phase is not Phase.GOTO_START:
-        return
-    target_ned_m = mission.climb.rest_ned_m(state) if mission.climb.cut_short else mission.start_ned_m
-    mission.trajectories.go_to(target_ned_m, inputs.now_us, state)
-    mission.trajectories.keep_destination()
+    if mission.phase is Phase.GOTO_START:
+        target_ned_m = mission.climb.rest_ned_m(state) if mission.climb.cut_short else mission.start_ned_m
+        mission.trajectories.go_to(target_ned_m, inputs.now_us, state)
+        mission.trajectories.keep_destination()
+    elif not mission.interruptions.active:
+        mission.go_on(inputs.now_us, inputs.utc_us, state)
     if mission.held:
         mission.interruptions.stay(inputs.now_us, state)
 
@@ -42,5 +43,5 @@ def take_control(mission: MissionState, inputs: PhaseInputs, state: VehicleState
 def leave_control(mission: MissionState, inputs: PhaseInputs) -> None:
     """Leave the vehicle to who has taken it: its autopilot, if setpoints have stopped."""
     stopped = inputs.setpoints_stopped
-    mission.override(f"{stopped}: the autopilot took over" if stopped else TAKEN_OVER)
+    mission.override(f"{stopped}: the autopilot took over" if stopped else TAKEN_OVER, inputs.now_us)
     mission.setpoints_stopped = bool(stopped)

@@ -57,10 +57,12 @@ class MissionState:
         phase: current phase.
         ready_utc_us: UTC at which the start position was reached, 0 before.
         begin_utc_us: UTC of mission time 0, None until all are ready.
+        ordered_begin_utc_us: UTC before which a mission that an operator has ordered does not begin; 0 without one.
         outcome: "completed", or why the mission was not; "" while it is under way.
         waits_for: unmet condition that keeps the vehicle on the ground, or from beginning the mission; or "".
         had_control: the autopilot follows our setpoints and control has not been given back.
         pilot_override: pilot or autopilot took over; lasts until an operator resumes.
+        overridden_us: monotonic time of the last takeover.
         offered: the mission that the order `mission` has flown.
         stop_verb: land or rtl, from the command until the stop begins.
         may_take_control: an operator's resume permits taking control from any mode.
@@ -80,7 +82,7 @@ class MissionState:
         self.duration_us = round(setup.duration_s * 1e6)
         self.phase, self.boots = Phase.CONNECT, 0
         self.outcome = self.outcome_before = self.waits_for = self.stop_verb = ""
-        self.ready_utc_us = self.entered_us = 0
+        self.ready_utc_us = self.ordered_begin_utc_us = self.entered_us = self.overridden_us = 0
         self.begin_utc_us: int | None = None
         self.first_tick_us: int | None = None
         self.requested_us = -REQUEST_PERIOD_US
@@ -194,9 +196,10 @@ class MissionState:
         self.requested_us = inputs.now_us
         return True
 
-    def override(self, why: str) -> None:
+    def override(self, why: str, now_us: int) -> None:
         """Note that pilot or autopilot took over."""
         self.pilot_override, self.had_control, self.may_take_control = True, False, False
+        self.overridden_us = now_us
         self.setpoints_stopped = False
         self.outcome_before = self.outcome
         self.outcome = why

@@ -67,8 +67,11 @@ def _change_mission(mission: MissionState, order: Order, now_us: int, utc_us: in
     assert offered is not None
     mission.mission_reference, mission.duration_us = offered.reference, round(offered.duration_s * 1e6)
     mission.trajectories.change_mission(offered.reference)
+    mission.ordered_begin_utc_us = round(order.arguments[BEGIN] * 1e6)
+    if mission.phase is Phase.READY and mission.begin_utc_us is not None:  # peers may have begun: they begin anew
+        mission.begin_utc_us = max(mission.begin_utc_us, mission.ordered_begin_utc_us)
     if mission.phase is Phase.TRACK:
-        mission.begin_utc_us = round(order.arguments[BEGIN] * 1e6)
+        mission.begin_utc_us = mission.ordered_begin_utc_us
         if not mission.interruptions.active:
             mission.rejoin_mission(now_us, utc_us, state)
 
@@ -79,19 +82,25 @@ def _resume(mission: MissionState, order: Order, now_us: int, utc_us: int, state
         if not mission.interruptions.paused:
             mission.go_on(now_us, utc_us, state)
     elif mission.pilot_override:
+        _excuse_waiting(mission, now_us, mission.overridden_us)
         mission.rejoin_mission(now_us, utc_us, state)
     if mission.pilot_override:
         mission.pilot_override, mission.outcome, mission.may_take_control = False, mission.outcome_before, True
 
 
 def _release(mission: MissionState, now_us: int, state: VehicleState) -> None:
-    """End a hold: timeouts have not run meanwhile."""
+    """End a hold."""
     mission.interruptions.end_hold()
     mission.requested_us = now_us - SPIN_UP_US
     if mission.phase is Phase.TAKEOFF and state.landed is not Landed.ON_GROUND:
         mission.climb.cut()
+    _excuse_waiting(mission, now_us, mission.interruptions.held_since_us)
+
+
+def _excuse_waiting(mission: MissionState, now_us: int, since_us: int) -> None:
+    """Let timeouts go on as if the time since then had not passed."""
     if mission.first_tick_us is not None:
-        mission.first_tick_us += now_us - mission.interruptions.held_since_us
+        mission.first_tick_us += now_us - since_us
     if mission.phase is Phase.GOTO_LAND:
         mission.entered_us = now_us
 

@@ -8,6 +8,7 @@ What is known of the mission is in `MissionState`, which others read; what is do
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 from swarmctl.control.failsafe.decision import Response
@@ -21,6 +22,7 @@ from swarmctl.control.phases.steps import ascent, descent, on_ground, tracking
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
 from swarmctl.core.types import Command, FlightMode, Mode, Phase, VehicleState
 
+_LATE_US, _AWAY_M = 200_000, 0.5  # from its begin and from the start, from which on its reference is approached
 _LEAST_HEIGHT_M = 0.5  # above the ground, of a point to go to
 REBOOTED = "the autopilot rebooted"
 OVERLOADED = "overload: deadlines were missed for too long"
@@ -51,11 +53,19 @@ class MissionStateMachine:
     def __init__(self, params: StateMachineParams, setup: MissionSetup) -> None:
         self.mission = MissionState(params, setup)
 
-    def begin_if_due(self, now_us: int, utc_us: int) -> None:
-        """Enter TRACK on time. Called before planning, so that the first plan of the mission follows its reference."""
-        mission = self.mission
-        if mission.phase is Phase.READY and mission.begin_utc_us is not None and utc_us >= mission.begin_utc_us:
-            mission.enter(Phase.TRACK, now_us)
+    def begin_if_due(self, now_us: int, utc_us: int, state: VehicleState | None) -> None:
+        """Enter TRACK on time. Called before planning, so that the first plan of the mission follows its reference.
+
+        An agent whose vehicle was away, in the hands of a pilot, goes to where the reference is by now.
+        """
+        mission, begins_us = self.mission, self.mission.begin_utc_us
+        if mission.phase is not Phase.READY or begins_us is None or utc_us < begins_us:
+            return
+        mission.enter(Phase.TRACK, now_us)
+        if state is None or mission.interruptions.active:
+            return
+        if utc_us - begins_us > _LATE_US or math.dist(state.pos_ned_m, mission.start_ned_m) > _AWAY_M:
+            mission.rejoin_mission(now_us, utc_us, state)
 
     def step(self, inputs: PhaseInputs) -> list[Command]:
         """Advance by one tick; returns the requests to the autopilot."""
@@ -65,7 +75,7 @@ class MissionStateMachine:
         if inputs.boots != mission.boots:
             mission.boots = inputs.boots
             if Phase.ARM <= mission.phase < Phase.DONE and not mission.pilot_override:
-                mission.override(REBOOTED)
+                mission.override(REBOOTED, inputs.now_us)
         if state is None:
             return []
         obeyed_orders.apply_stop(mission, inputs.now_us, state)
@@ -131,11 +141,15 @@ class MissionStateMachine:
         self._pause(inputs, state)
 
     def _escalate(self, inputs: PhaseInputs, state: VehicleState) -> None:
-        """Fly home, or land, as battery and link ask for; a vehicle on its way home lands where it is, if it has to."""
+        """Fly home, or land, as battery and link ask for; a vehicle on its way home lands where it is, if it has to.
+
+        Without a plan it waits for one: from there its autopilot, which knows no others, would land it at once.
+        """
         mission, response, why = self.mission, inputs.escalation.response, inputs.escalation.reason
         flies_home = mission.phase is Phase.GOTO_LAND and not mission.landing.in_place
-        controls = mission.had_control and inputs.mode in PLAN_MODES
-        if response is Response.RTL and mission.may_fly_on and controls:
+        if mission.had_control and inputs.mode not in PLAN_MODES:
+            return
+        if response is Response.RTL and mission.may_fly_on and mission.had_control:
             mission.outcome = mission.outcome or f"{why}: flew back"
             mission.go_home(inputs.now_us, state)
         elif (response >= Response.RTL and mission.may_fly_on) or (response is Response.LAND and flies_home):

@@ -20,8 +20,13 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
     if not state.armed:  # pilot or autopilot disarmed it: it is not armed again
         mission.give_up("disarmed before take-off", inputs, state)
         return []
+    others = handover.is_under_other_control(state)
+    mission.climb.was_ours |= not others
+    if others and mission.climb.was_ours and not mission.may_take_control:  # who was armed in another mode takes off
+        handover.leave_control(mission, inputs)
+        return []
     if mission.held:
-        ours = state.mode is not FlightMode.HOLD and not handover.is_under_other_control(state)
+        ours = state.mode is not FlightMode.HOLD and not others
         return [Command(verb=Verb.HOLD)] if ours and mission.may_request(inputs) else []
     if (
         state.mode is not FlightMode.TAKEOFF

@@ -15,6 +15,8 @@ def goto_land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -
     """Fly to the landing place; after too long, land where the vehicle is."""
     if mission.held:
         return []
+    if mission.may_take_control and not mission.had_control:  # a pilot has given it back
+        return handover.request_control(mission, inputs, state)
     landing, controls = mission.landing, mission.had_control
     waited_us = inputs.now_us - mission.entered_us
     if landing.is_reached(inputs, state, controls=controls, paused=mission.interruptions.paused):
@@ -43,7 +45,7 @@ def land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> lis
         return []
     ours = state.mode in handover.OWN_MODES and not mission.landing_seen  # else a pilot flies, or aborted the landing
     if not ours and state.landed is not Landed.ON_GROUND:
-        mission.override(TAKEN_OVER)
+        mission.override(TAKEN_OVER, inputs.now_us)
         return []
     if not mission.may_request(inputs):
         return []

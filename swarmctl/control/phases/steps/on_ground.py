@@ -36,7 +36,7 @@ def standby(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
 def arm(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
     """Request arming, in the flight mode that the autopilot requires for it."""
     if state.armed and mission.airborne and not mission.may_take_control and handover.is_under_other_control(state):
-        mission.override(TAKEN_OVER)  # decided before the first setpoint, which would already take control
+        mission.override(TAKEN_OVER, inputs.now_us)  # before the first setpoint, which would already take control
         return []
     if state.armed:
         mission.enter(Phase.GOTO_START if mission.airborne else Phase.TAKEOFF, inputs.now_us)

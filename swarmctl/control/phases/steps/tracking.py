@@ -21,8 +21,11 @@ def ready(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> li
     absent = mission.peers - inputs.excused - ready_us.keys()
     mission.waits_for = f"{names_of(absent)} to reach the start" if absent else ""
     if not absent:
-        mission.begin_utc_us = max([mission.ready_utc_us, *ready_us.values()]) + BEGIN_DELAY_US
-    return []
+        agreed_us = max([mission.ready_utc_us, *ready_us.values()]) + BEGIN_DELAY_US
+        mission.begin_utc_us = max(agreed_us, mission.ordered_begin_utc_us)
+    if mission.had_control or mission.held:
+        return []
+    return handover.request_control(mission, inputs, state)  # a pilot has given it back
 
 
 def track(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:

@@ -1,0 +1,110 @@
+"""Tests of what follows when a pilot brings a vehicle down or gives it back, and of orders that come in between."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from swarmctl.control.failsafe.decision import Escalation, Response
+from swarmctl.control.phases.mission_state import TAKEN_OVER
+from swarmctl.control.phases.trajectories import OfferedMission
+from swarmctl.control.reference.mission import MissionParams, MissionReference
+from swarmctl.core.types import FlightMode, Mode, Phase, Verb
+from tests.benches.state_machine_flight import START, UTC0_US, Flight
+
+
+@pytest.mark.parametrize("mode", [FlightMode.LAND, FlightMode.RTL, FlightMode.MANUAL])
+def test_a_vehicle_that_a_pilot_brings_down_while_it_takes_off_stays_down(mode: FlightMode) -> None:
+    flight = Flight().until(Phase.TAKEOFF)
+    flight.flight_mode = FlightMode.TAKEOFF
+    flight.step()
+    flight.flight_mode = mode
+    assert flight.run(20.0) == [], "it would take off at who walks up to it"
+    assert flight.mission.outcome == TAKEN_OVER
+    flight.armed = False
+    flight.run(1.0)
+    assert flight.phase is Phase.DONE
+
+
+def test_a_vehicle_that_was_armed_in_another_mode_takes_off() -> None:
+    flight = Flight().until(Phase.ARM)
+    flight.flight_mode, flight.armed = FlightMode.MANUAL, True
+    flight.step()
+    assert Verb.TAKEOFF in flight.run(1.0)
+
+
+def away(phase: Phase, seconds: float) -> Flight:
+    """Return a flight whose pilot took the vehicle 20 m away in a phase, and gives it back after some time."""
+    flight = Flight().until(phase)
+    flight.flight_mode = FlightMode.MANUAL
+    flight.failsafe_mode = Mode.PILOT_OVERRIDE
+    flight.run(seconds)
+    flight.pos = flight.pos + np.array([20.0, 0.0, 0.0])
+    flight.flight_mode, flight.failsafe_mode = FlightMode.HOLD, Mode.PRIMING
+    assert flight.ask("resume") == ""
+    return flight
+
+
+@pytest.mark.parametrize("phase", [Phase.READY, Phase.GOTO_LAND])
+def test_a_vehicle_given_back_outside_of_the_mission_is_asked_for_and_goes_on(phase: Phase) -> None:
+    flight = away(phase, 5.0)
+    flight.peer(Phase.GOTO_START if phase is Phase.READY else Phase.GOTO_LAND)
+    assert flight.run(0.5) == [Verb.EXTERNAL], "setpoints must not be sent at an autopilot that does not follow them"
+    flight.flight_mode, flight.failsafe_mode = FlightMode.EXTERNAL, Mode.TRACKING
+    flight.step()
+    reference, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.zeros(1))
+    assert np.linalg.norm(reference[0] - flight.pos) < 0.5, "it begins where the vehicle is"
+    assert flight.phase is phase
+
+
+@pytest.mark.parametrize("begun", [False, True], ids=["begins_later", "has_begun"])
+def test_the_mission_is_approached_by_who_was_away_when_it_began(begun: bool) -> None:
+    flight = away(Phase.READY, 5.0)
+    flight.flight_mode, flight.failsafe_mode = FlightMode.EXTERNAL, Mode.TRACKING
+    flight.step()
+    ready_us = flight.utc_us - (3_000_000 if begun else 0)
+    flight.peer(Phase.TRACK if begun else Phase.READY, ready_us)
+    for _ in range(15):
+        flight.step()
+    assert flight.at == "TRACK"
+    reference, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.zeros(1))
+    assert np.linalg.norm(reference[0] - flight.pos) < 2.5
+
+
+def test_the_time_with_a_pilot_does_not_count_as_waiting() -> None:
+    flight = away(Phase.READY, 200.0)
+    flight.peer(Phase.GOTO_START)
+    assert Verb.LAND not in flight.run(5.0)
+    assert flight.phase is Phase.READY
+
+
+@pytest.mark.parametrize("response", [Response.RTL, Response.LAND])
+def test_a_worn_battery_waits_for_a_plan(response: Response) -> None:
+    flight = Flight().until(Phase.TRACK)
+    flight.pos = flight.pos + np.array([5.0, 0.0, 0.0])
+    flight.failsafe_mode, flight.escalation = Mode.BRAKE, Escalation(response, "battery at 15 %")
+    assert flight.run(1.0) == []
+    assert flight.at == "TRACK"
+    flight.failsafe_mode = Mode.TRACKING
+    flight.step()
+    assert flight.at == "GOTO_LAND"
+    assert flight.mission.landing.in_place == (response is Response.LAND)
+
+
+def test_a_mission_ordered_while_some_wait_begins_for_all_at_the_time_of_the_order() -> None:
+    offered = OfferedMission(
+        reference=MissionReference(MissionParams(kind="hover"), START[None, :], 0), duration_s=9.0, text="{}"
+    )
+    begins = {}
+    for phase in (Phase.READY, Phase.TRACK):
+        flight = Flight().until(Phase.READY)
+        while flight.mission.begin_utc_us is None:
+            flight._obey(flight.step())
+        while flight.phase < phase:
+            flight.step()
+        flight.mission.offered = offered
+        begin_s = UTC0_US * 1e-6 + 60.0
+        assert flight.ask("mission", begin_utc_s=begin_s, mission=1.0) == ""
+        flight.step()
+        begins[phase] = flight.mission.begin_utc_us
+    assert begins[Phase.READY] == begins[Phase.TRACK]
