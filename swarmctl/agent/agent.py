@@ -192,7 +192,7 @@ class Agent:
         planning = self._planner.plan(now_us, state)
         planned_ns = stopwatch_ns()
         flown = self._decide(now_us, state, planning)
-        setpoint = self._act(now_us, flown, planning)
+        setpoint = self._act(now_us, state, flown, planning)
         self.timing = self._timing(began_ns, sensed_ns, planned_ns, stopwatch_ns(), planning.plan)
         self._share(state, flown)
         self._advance(now_us, state)
@@ -270,12 +270,15 @@ class Agent:
         self._controller_watch.count(self._mission.phase, plan, flown)
         return flown
 
-    def _act(self, now_us: int, flown: Plan | None, planning: PlanningResult) -> AttitudeSetpoint | None:
+    def _act(
+        self, now_us: int, state: VehicleState | None, flown: Plan | None, planning: PlanningResult
+    ) -> AttitudeSetpoint | None:
         """Send the setpoint of the tick; return it, None if none has left."""
         setpoint = self._setpoints.send(
             now_us,
             flown,
             planning.start,
+            state,
             flies=self._modes.mode in FLOWN_BY_AGENT,
             committed_peers=self._planner.directive.committed_peers,
         )

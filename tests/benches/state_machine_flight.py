@@ -109,7 +109,7 @@ class Flight:
             escalation=self.escalation,
             armed_told_us=self.now_us if self.beat_us is None else self.beat_us,
         )
-        self.state_machine.begin_if_due(inputs.now_us, inputs.utc_us, inputs.state)  # called before planning, as by the agent
+        self.state_machine.begin_if_due(inputs.now_us, inputs.utc_us, inputs.state)  # before planning
         asked = self.state_machine.step(inputs)
         self.now_us += 100_000
         return asked

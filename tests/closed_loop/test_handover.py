@@ -17,6 +17,8 @@ from swarmctl.config import load
 from swarmctl.control.phases import handover, obeyed_orders
 from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
 from swarmctl.control.phases.state_machine import REBOOTED
+from swarmctl.control.reference.heading import Heading
+from swarmctl.core.frames import euler_from_quat
 from swarmctl.core.types import FlightMode, Phase, VehicleState
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
@@ -227,3 +229,29 @@ def test_an_arducopter_whose_thrust_would_be_a_climb_rate_is_not_armed() -> None
     assert flight.agent.finished
     assert "set agent.autopilot_params.GUID_OPTIONS = 8" in flight.agent.outcome
     assert not flight.run.world.truth_rows()[0]["armed"]
+
+
+# -- a vehicle that stands at another heading than the mission's ------------------------------------------------------
+
+
+X500 = ("sitl.preset=x500", "vehicle_model={attitude_rad_s=9.5,drag_1_s=0.3,hover_thrust_01=0.49}")
+
+
+def turned_rad_s() -> float:
+    """Return the fastest turn of a vehicle that faces north and whose mission faces 115 degrees."""
+    flight, yaws = Watched("mission.yaw_rad=2.0", *X500), []
+    while mission_t_s(flight.run) < 2.0:
+        flight.step_for(0.02)
+        assert flight.now_us < 60_000_000
+        yaws.append(euler_from_quat(flight.run.world.truth_rows()[0]["q_nb"])[2])
+    assert abs(yaws[0]) < 0.1
+    return float(np.abs(np.diff(np.unwrap(yaws))).max() * 50.0)
+
+
+def test_at_the_handover_it_turns_from_its_own_heading_at_a_bounded_rate() -> None:
+    assert turned_rad_s() < 1.6
+
+
+def test_negative_control_without_its_own_heading_it_is_turned_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Heading, "begin", lambda *_: None)
+    assert turned_rad_s() > 2.3

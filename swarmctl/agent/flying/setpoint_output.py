@@ -13,8 +13,9 @@ from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.mpc.problem import Start
 from swarmctl.control.reference.heading import Heading
 from swarmctl.control.setpoint import setpoint_of
+from swarmctl.core.frames import euler_from_quat
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.types import AttitudeSetpoint, Plan
+from swarmctl.core.types import AttitudeSetpoint, Plan, VehicleState
 
 
 class SetpointOutput:
@@ -48,6 +49,7 @@ class SetpointOutput:
         now_us: int,
         flown: Plan | None,
         start: Start | None,
+        state: VehicleState | None,
         *,
         flies: bool,
         committed_peers: Mapping[int, Sequence[Trajectory]],
@@ -58,6 +60,7 @@ class SetpointOutput:
             now_us: monotonic time.
             flown: plan of this tick; None: nothing is sent.
             start: predicted state at which the setpoint acts; None: nothing is sent.
+            state: newest one of the vehicle.
             flies: the agent flies the vehicle in this tick's mode.
             committed_peers: trajectories that peers have committed to.
         """
@@ -75,6 +78,8 @@ class SetpointOutput:
             flies=flies,
             committed_peers=committed_peers,
         )
+        if not flies and state is not None:
+            self._heading.begin(euler_from_quat(state.q_nb)[2])
         yaw_rad = self._heading.at(now_us, self._references.heading_rad(self._ports.utc_of_us(now_us)))
         setpoint = setpoint_of(virtual_control, yaw_rad, estimate.hover_thrust_01, now_us, params=self._model)
         if refused := self._ports.autopilot.send(setpoint, self._ports.clock.now_us()):

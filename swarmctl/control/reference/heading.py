@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+_TURNED_RAD = 0.1  # beyond errors of estimates and of flight: the vehicle stands at another heading
 _RATE_RAD_S = 1.0  # slow beside the attitude loop, so that thrust keeps pointing where it is planned to
 
 
@@ -17,6 +18,11 @@ class Heading:
     def __init__(self, first_yaw_rad: float) -> None:
         self._yaw_rad = first_yaw_rad
         self._then_us: int | None = None
+
+    def begin(self, yaw_rad: float) -> None:
+        """Begin from the heading [rad] of a vehicle that somebody else flies, or that stands on the ground."""
+        if abs(math.remainder(yaw_rad - self._yaw_rad, math.tau)) > _TURNED_RAD:
+            self._yaw_rad = yaw_rad
 
     def at(self, now_us: int, asked_yaw_rad: float | None) -> float:
         """Return the heading of the setpoint of this tick.

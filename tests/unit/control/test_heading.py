@@ -36,3 +36,16 @@ def test_after_a_gap_it_does_not_jump() -> None:
     heading = Heading(0.0)
     heading.at(0, None)
     assert abs(heading.at(60_000_000, 3.0)) <= 0.1
+
+
+def test_a_vehicle_that_stands_at_another_heading_is_turned_from_there() -> None:
+    heading = Heading(0.0)
+    heading.begin(2.0)
+    assert abs(heading.at(0, 0.0) - 2.0) < 0.03
+    assert abs(turn(heading, 0.0, 1.0)[-1]) < 1.1, "a second later"
+
+
+def test_what_estimates_are_off_by_turns_nothing() -> None:
+    heading = Heading(0.5)
+    heading.begin(0.58)
+    assert heading.at(0, None) == 0.5
