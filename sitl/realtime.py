@@ -17,6 +17,7 @@ from typing import BinaryIO
 from sitl.fault_socket import ControlSocket
 from sitl.world import SitlWorld
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.files import hold
 from swarmctl.mavlink.transport import bind_udp
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.wall_clock import monotonic_us
@@ -50,6 +51,7 @@ class TruthFile:
             self._file: BinaryIO = path.open("ab", buffering=1 << 16)
         except OSError as error:
             raise ConfigError("sitl", [f"truth = {path}: {error.strerror}; allowed: a writable file"]) from error
+        hold(self._file.fileno())  # a report must not pack and remove what is still written
         self._next_us = self._flush_us = 0
         self._broken: OSError | None = None
 

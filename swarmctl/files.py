@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import secrets
 import stat
@@ -63,6 +64,27 @@ def _why_not_private(status: os.stat_result) -> str:
     if stat.S_IMODE(status.st_mode) & 0o077:
         return f"has mode {stat.S_IMODE(status.st_mode):04o}, so that others may read or write it; chmod 600 it"
     return ""
+
+
+def hold(fd: int) -> None:
+    """Mark an open file as one that is still written, until it is closed or the process ends; see `is_held`."""
+    with contextlib.suppress(OSError):  # a file system without locks must not cost what is written
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_held(path: Path) -> bool:
+    """Return whether a process still writes to a file that it has marked; not known of one that can't be opened."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
+    finally:
+        os.close(fd)
+    return False
 
 
 def create_private(path: Path, content: bytes) -> None:

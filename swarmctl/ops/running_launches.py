@@ -72,8 +72,8 @@ def find_launch(run: str | None) -> RunningLaunch:
         ConfigError: there are several, and none of them is chosen.
     """
     if run is not None and (Path(run) / LAUNCH_FILE).exists():
-        launch = _read(Path(run) / LAUNCH_FILE)
-        if launch is None or not runs(launch):
+        launch = launch_in(Path(run))
+        if launch is None:
             raise StartError(f"--run {run}: no launch runs there. See what does with: swarmctl status")
         return _flying(launch)
     running = running_launches()
@@ -102,6 +102,12 @@ def running_launches() -> list[RunningLaunch]:
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
     return sorted(running.values(), key=lambda launch: launch.started_s, reverse=True)
+
+
+def launch_in(directory: Path) -> RunningLaunch | None:
+    """Return the launch of a run folder if it still runs; also while it is ending."""
+    launch = _read(directory / LAUNCH_FILE)
+    return launch if launch is not None and runs(launch) else None
 
 
 def runs(launch: RunningLaunch) -> bool:

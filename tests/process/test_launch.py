@@ -54,6 +54,9 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     viewer = launched.pid_of("swarmctl.telemetry.view.viewer")
     assert policies(viewer) == {os.SCHED_OTHER}, "it waits for those that fly"
     assert launched.verb("status").returncode == 0
+    refused = launched.verb("report", str(launched.run_dir))
+    assert (refused.returncode, refused.stdout) == (3, "")
+    assert "still flies or is ending" in refused.stderr
     assert launched.end() == 0, launched.text()
     for i in range(3 * realtime):
         (asked,) = launched.events("realtime", f"agent-{i}")
@@ -167,10 +170,13 @@ def a_killed_launcher_leaves_nothing(start: Start) -> None:
     launched.until_phase("TRACK", 2)
     launched.process.kill()
     launched.process.wait(20)
+    refused = launched.verb("report", str(launched.run_dir))
+    assert (refused.returncode, "is still written" in refused.stderr) == (3, True), refused.stderr
     deadline_s = time.monotonic() + 30.0
     while any(not path.endswith(".json") for path in launched.leftovers()) and time.monotonic() < deadline_s:
         time.sleep(0.2)
     assert all(path.endswith(".json") for path in launched.leftovers()), launched.leftovers()
+    assert launched.verb("report", str(launched.run_dir)).returncode == 0
     assert launched.verb("status").returncode == 3, "the note it left is recognised as stale"
     assert launched.leftovers() == []
 

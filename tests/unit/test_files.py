@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from swarmctl.files import read_file, replace_bytes, replace_text, replaced, replaced_by_program
+from swarmctl.files import hold, is_held, read_file, replace_bytes, replace_text, replaced, replaced_by_program
 
 
 def test_a_file_is_read_whole(tmp_path: Path) -> None:
@@ -109,3 +109,18 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
 def test_text_with_lone_surrogates_is_written(tmp_path: Path) -> None:
     replace_text(tmp_path / "a", "lone \ud800 surrogate")
     assert (tmp_path / "a").read_text() == "lone ? surrogate"
+
+
+def test_a_file_is_held_until_it_is_closed(tmp_path: Path) -> None:
+    path, free = tmp_path / "rows", tmp_path / "free"
+    free.write_bytes(b"")
+    with path.open("ab") as file:
+        hold(file.fileno())
+        assert [is_held(path), is_held(path), is_held(free), is_held(tmp_path / "none")] == [True, True, False, False]
+    assert not is_held(path)
+    os.mkfifo(tmp_path / "pipe")
+    assert not is_held(tmp_path / "pipe"), "opening it would wait for a writer"
+
+
+def test_a_file_that_cannot_be_held_costs_nothing() -> None:
+    hold(-1 % 2**15)  # no such descriptor

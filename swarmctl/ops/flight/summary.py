@@ -8,7 +8,9 @@ from typing import Any
 
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
+from swarmctl.errors import StartError
 from swarmctl.mavlink.signing.refusals import HARMLESS
+from swarmctl.ops.running_launches import launch_in
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 
@@ -55,9 +57,13 @@ def rewrite_report(directory: Path) -> Path:
 
     Raises:
         ConfigError: it is no run folder.
+        StartError: the run is not over yet.
     """
-    from swarmctl.telemetry.recording.run_folder import report_run  # heavy
+    from swarmctl.telemetry.recording.run_files import read_summary  # heavy
+    from swarmctl.telemetry.recording.run_folder import report_run
 
+    if read_summary(directory) is None and launch_in(directory) is not None:
+        raise StartError(f"{directory}: its launch still flies or is ending, see: swarmctl status")
     return report_run(directory, load_recorded(directory).rules())
 
 

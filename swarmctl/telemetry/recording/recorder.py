@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, plan_rows
 from swarmctl.core.types import Plan
+from swarmctl.files import hold
 from swarmctl.telemetry.json_safe import to_json
 
 _FLUSH_TIMEOUT_S = 0.25
@@ -147,6 +148,7 @@ class _RowFile:
             self._next_try_s = now_s + _REOPEN_S
             try:
                 self._fd = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+                hold(self._fd)  # a report must not pack and remove what is still written
                 size = os.fstat(self._fd).st_size
                 self._good_size = size - size % self._row_bytes
                 if self._good_size < size:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from swarmctl.core.recorded.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.files import replace_text, write_each
+from swarmctl.files import is_held, replace_text, write_each
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
 from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
@@ -132,9 +132,10 @@ def report_run(directory: Path, rules: Rules) -> Path:
 
     Raises:
         ConfigError: a file in the folder has not the expected content.
-        StartError: the folder can't be written to.
+        StartError: the folder can't be written to, or the run is not finished and somebody still records it.
     """
     if read_summary(directory) is None:
+        _refuse_recorded(directory)
         finished = finish_run(
             directory, rules, Outcome(outcome="failed", problems=("the launcher did not finish this run",))
         )
@@ -146,6 +147,18 @@ def report_run(directory: Path, rules: Rules) -> Path:
         return write_report(directory, judged.run, judged.summary, judged.config_text, rules=judged.rules)
     except OSError as error:
         raise StartError(f"{directory / REPORT}: can't be written: {error.strerror or error}") from error
+
+
+def _refuse_recorded(directory: Path) -> None:
+    """Check that nobody writes to the raw files of an unfinished run, which are packed and removed when it is finished.
+
+    Raises:
+        StartError: somebody does.
+    """
+    for pattern in ("*.ticks", "*.plans", f"*.{EVENTS}", TRUTH):
+        for path in sorted(directory.glob(pattern)):
+            if is_held(path):
+                raise StartError(f"{path}: is still written: the run is not over. Wait until its agents have ended")
 
 
 def write_run_figures(directory: Path, rules: Rules, *, png: bool = False) -> Path:

@@ -16,6 +16,7 @@ from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.files import is_held
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.simulator_config import SimulatorConfig
@@ -78,6 +79,7 @@ def test_truth_file_is_an_array(tmp_path: Path) -> None:
         truth.record(world, clock.now_us())
         if k == 300:
             assert (tmp_path / "truth.bin").stat().st_size > 0  # flushed while flying
+            assert is_held(tmp_path / "truth.bin")
     assert truth.close() == ""
     rows = np.fromfile(tmp_path / "truth.bin", TRUTH_DTYPE)
     assert len(rows) == pytest.approx(100, abs=1)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from swarmctl.core.recorded.records import TICK_DTYPE, tick_row
 from swarmctl.core.types import Plan
+from swarmctl.files import is_held
 from swarmctl.telemetry.recording import recorder as recorder_module
 from swarmctl.telemetry.recording.recorder import Recorder
 from swarmctl.telemetry.recording.run_files import load_run, read_plans, read_rows
@@ -167,6 +168,19 @@ def test_partial_row_of_a_killed_agent_does_not_shift_later_rows(tmp_path: Path)
     again.tick(*told(1))
     again.close(5.0)
     assert load_run(tmp_path).ticks[0]["seq"].tolist() == [0, 1]
+
+
+def test_files_are_held_while_an_agent_records(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, 0)
+    recorder.tick(*told(0))
+    recorder.event("phase", 1, 1)
+    until_s = time.monotonic() + 30
+    while len(list(tmp_path.iterdir())) < 3 and time.monotonic() < until_s:
+        time.sleep(0.05)
+    held = {path.name for path in tmp_path.iterdir() if is_held(path)}
+    recorder.close(5.0)
+    assert held == {"agent-0.ticks", "agent-0.plans", "agent-0.events.jsonl"}
+    assert not any(map(is_held, tmp_path.iterdir()))
 
 
 def test_an_agent_does_not_load_pyarrow_or_rerun() -> None:

@@ -21,6 +21,7 @@ from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import ControlMode, FlightMode, Mode, Phase, PlanStatus
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.files import hold
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
@@ -282,6 +283,22 @@ def test_finished_run_is_complete_and_may_be_finished_again(tmp_path: Path) -> N
     assert finish_run(tmp_path, RULES, Outcome(outcome="completed", events=own)) == (summary, ())
     assert len((tmp_path / "events.jsonl").read_text().splitlines()) == 4
     assert json.loads((tmp_path / "summary.json").read_text()) == summary
+
+
+def test_report_of_a_run_that_is_still_recorded_leaves_its_files(tmp_path: Path) -> None:
+    """The launcher may have died while its agents land."""
+    write_run(tmp_path, 3, 6.0)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for name in ("agent-1.ticks", "agent-1.events.jsonl", "truth.bin"):
+        with (tmp_path / name).open("ab") as file:
+            hold(file.fileno())
+            with pytest.raises(StartError, match=rf"{name}: is still written"):
+                report_run(tmp_path, RULES)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert report_run(tmp_path, RULES).exists()
+    with (tmp_path / "agent-1.ticks").open("ab") as file:
+        hold(file.fileno())
+        assert report_run(tmp_path, RULES).exists(), "nothing of a finished run is packed"
 
 
 def test_report_of_a_run_whose_launcher_died_says_so(tmp_path: Path) -> None:

@@ -6,9 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from swarmctl.config import Config, dump
+from swarmctl.errors import StartError
+from swarmctl.ops.flight.summary import rewrite_report
+from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch, process_start_s
 from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
 from tests.unit.telemetry.test_run_folder import RULES, write_run
 
@@ -91,3 +95,17 @@ def test_a_recording_that_cannot_be_judged_costs_the_figures_and_not_the_verdict
     assert lines[2].startswith("failed, ")
     assert "can't be judged" in lines[-2]
     assert lines[-1] == "exit code 4"
+
+
+def test_report_of_a_launch_that_runs_is_refused_until_it_has_ended(folder: Path) -> None:
+    before = {path.name for path in folder.iterdir()}
+    started_s, pid = process_start_s()
+    launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder), ending=True)
+    (folder / LAUNCH_FILE).write_bytes(msgspec.json.encode(launch))
+    with pytest.raises(StartError, match="still flies or is ending, see: swarmctl status"):
+        rewrite_report(folder)
+    assert {path.name for path in folder.iterdir()} == before | {LAUNCH_FILE}
+    (folder / LAUNCH_FILE).write_bytes(msgspec.json.encode(msgspec.structs.replace(launch, started_s=started_s - 60)))
+    assert rewrite_report(folder).exists()
+    (folder / LAUNCH_FILE).write_bytes(msgspec.json.encode(launch))
+    assert rewrite_report(folder).exists(), "it is finished: nothing is packed"
