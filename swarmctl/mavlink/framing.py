@@ -1,8 +1,9 @@
-"""Frame boundaries of MAVLink in received bytes. Checksums are not verified here."""
+"""Frame boundaries of MAVLink in streams of bytes, received and sent. Checksums are not verified here."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 _START_2 = re.compile(b"\xfd")
 _START_1_OR_2 = re.compile(b"[\xfd\xfe]")
@@ -49,3 +50,31 @@ def frames(datagram: bytes, version_1: bool = False) -> list[bytes]:
 def message_id(frame: bytes) -> int:
     """Return the message id of a MAVLink 2 frame."""
     return int.from_bytes(frame[7:10], "little")
+
+
+class FrameWriter:
+    """Writes frames to a stream that takes what fits: whole ones, or none of a frame.
+
+    The rest of a frame that was taken in part goes before the next one, which is dropped while that does not fit.
+    """
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def send(self, write: Callable[[bytes], int], frame: bytes) -> None:
+        """Send one frame by `write`, which returns how many bytes it has taken and never blocks.
+
+        Raises:
+            OSError: the stream is lost.
+        """
+        try:
+            if self._rest:
+                self._rest = self._rest[write(self._rest) :]
+            if not self._rest:
+                self._rest = frame[write(frame) :]
+        except (BlockingIOError, InterruptedError):
+            return
+
+    def clear(self) -> None:
+        """Forget a rest: the stream begins again."""
+        self._rest = b""

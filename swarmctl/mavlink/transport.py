@@ -7,6 +7,8 @@ reopened without limit: a lost vehicle is judged elsewhere.
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import re
 import socket
 import struct
@@ -14,10 +16,11 @@ import sys
 import zlib
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 from swarmctl.errors import StartError
-from swarmctl.mavlink.framing import cut_frames
+from swarmctl.mavlink.framing import FrameWriter, cut_frames
 from swarmctl.mavlink.latch import Address, Greeting, IsVehicle, Latch, admit_only, anybody, silence
 from swarmctl.wall_clock import utc_us
 
@@ -255,18 +258,13 @@ class TcpTransport:
         self._open_us: int | None = None  # begin of the last attempt
         self._received_us = 0
         self._buffer = bytearray()
-        self._rest = b""  # remainder of a frame that was sent in part
+        self._writer = FrameWriter()
 
     def send(self, data: bytes) -> None:
         if self._sock is None:
             return
         try:
-            if self._rest:
-                self._rest = self._rest[self._sock.send(self._rest) :]
-            if not self._rest:
-                self._rest = data[self._sock.send(data) :]
-        except (BlockingIOError, InterruptedError):
-            return
+            self._writer.send(self._sock.send, data)
         except OSError:
             self._lose()
 
@@ -304,33 +302,41 @@ class TcpTransport:
     def _lose(self) -> None:
         if self._sock is not None:
             self._sock.close()
-        self._sock, self._rest = None, b""
+        self._sock = None
+        self._writer.clear()
         self._buffer.clear()
 
 
 class SerialTransport:
-    """A serial port that cuts frames out of the byte stream; it is reopened after it was unplugged."""
+    """A serial port that cuts frames out of the byte stream; it is reopened after it was unplugged.
+
+    No other program of ours shares it: each would read bytes of the other's frames. Frames that do not fit into the
+    output buffer are dropped whole.
+    """
 
     def __init__(self, device: str, baud: int) -> None:
         import serial  # only serial links need it
 
         def open_port() -> Any:
-            return serial.Serial(device, baud, timeout=0, write_timeout=0)
+            return serial.Serial(device, baud, timeout=0, exclusive=True)
 
         self._open_port: Callable[[], Any] = open_port
         try:
             self._port: Any = open_port()
         except (OSError, ValueError) as error:  # SerialException is an OSError
-            raise StartError(f"serial {device} at {baud} baud can't be opened: {error}") from error
+            taken = isinstance(error, OSError) and error.errno in (errno.EWOULDBLOCK, errno.EBUSY)
+            why = "it is in use by another program; end that one" if taken else error
+            raise StartError(f"serial {device} at {baud} baud can't be opened: {why}") from error
         self._lost_us: int | None = None
         self._lost = False
         self._buffer = bytearray()
+        self._writer = FrameWriter()
 
     def send(self, data: bytes) -> None:
         if self._port is None:
             return
         try:
-            self._port.write(data)
+            self._writer.send(partial(os.write, self._port.fileno()), data)  # pyserial's waits for room
         except OSError:
             self._lost = True
 
@@ -355,6 +361,7 @@ class SerialTransport:
                 self._port.close()
             self._port, self._lost_us = None, now_us
             self._buffer.clear()
+            self._writer.clear()
         if self._port is None and self._lost_us is not None and now_us - self._lost_us >= _REOPEN_US:
             self._lost_us = now_us
             with contextlib.suppress(OSError):

@@ -239,6 +239,55 @@ def test_serial_passes_on_whole_frames() -> None:
     os.close(slave)
 
 
+def test_a_serial_port_is_opened_once() -> None:
+    master, slave = pty.openpty()
+    url = f"serial://{os.ttyname(slave)}:57600"
+    first = open_transport(url)
+    with pytest.raises(StartError, match=r"at 57600 baud can't be opened: it is in use by another program"):
+        open_transport(url)
+    first.close()
+    open_transport(url).close()
+    os.close(master)
+    os.close(slave)
+
+
+@pytest.mark.timeout(20)
+def test_a_serial_port_that_takes_nothing_costs_frames_and_no_time() -> None:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    link = SerialTransport(os.ttyname(slave), 57600)
+    sent = [frame(str(number).encode() * 7) for number in range(5000)]
+    begun_s = time.monotonic()
+    for data in sent:
+        link.send(data)
+    assert time.monotonic() - begun_s < 2.0
+    os.set_blocking(master, False)
+    arrived = drained(master)
+    assert 0 < len(arrived) < sum(map(len, sent)), "its buffer was full"
+    last = frame(b"last")
+    link.send(last)
+    arrived += drained(master)
+    taken = cut_frames(bytearray(arrived))
+    assert b"".join(taken) == arrived, "the rest of a frame goes before the next one"
+    assert taken[-1] == last
+    assert [data for data in sent if data in set(taken)] == taken[:-1]
+    link.close()
+    os.close(master)
+    os.close(slave)
+
+
+def drained(fd: int) -> bytes:
+    """Return all bytes that have arrived at the far end."""
+    data, silent = b"", 0
+    while silent < 5:
+        try:
+            data, silent = data + os.read(fd, 65536), 0
+        except BlockingIOError:
+            silent += 1
+            time.sleep(0.01)
+    return data
+
+
 def test_a_missing_serial_device_is_a_start_error_with_its_name() -> None:
     with pytest.raises(StartError, match="/dev/no-such-port at 57600"):
         open_transport("serial:///dev/no-such-port:57600")
