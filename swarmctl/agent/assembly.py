@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -35,6 +35,7 @@ def make_agent(
     on_frame: Callable[[bytes], None],
     stopwatch_ns: Callable[[], int],
     signing: SigningChannel | None = None,
+    originals: Mapping[str, int | float] | None = None,
 ) -> Agent:
     """Build an agent and connect it to its vehicle, its peers and its recorder.
 
@@ -46,6 +47,7 @@ def make_agent(
         on_frame: called with every MAVLink frame sent or received.
         stopwatch_ns: measures the tick [ns].
         signing: signs and verifies the frames of the link; None: they are plain.
+        originals: see `AgentSetup`.
     """
     autopilot, commands = _connect_vehicle(config, agent, transport, on_frame, signing)
     ports = Ports(
@@ -56,7 +58,7 @@ def make_agent(
         sink=sink,
         stopwatch_ns=stopwatch_ns,
     )
-    return Agent(_setup_of(config, agent, boot_id), ports)
+    return Agent(_setup_of(config, agent, boot_id, originals or {}), ports)
 
 
 def _connect_vehicle(
@@ -78,7 +80,7 @@ def _connect_vehicle(
     return autopilot, commands
 
 
-def _setup_of(config: Config, agent: int, boot_id: int) -> AgentSetup:
+def _setup_of(config: Config, agent: int, boot_id: int, originals: Mapping[str, int | float]) -> AgentSetup:
     swarm = config.swarm
     return AgentSetup(
         agent=agent,
@@ -95,4 +97,5 @@ def _setup_of(config: Config, agent: int, boot_id: int) -> AgentSetup:
         volume=config.volume.flight_volume(),
         fence_ne_m=config.geofence.corners_ne_m,
         drift_m=config.drift_m,
+        originals=originals,
     )

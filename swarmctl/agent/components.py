@@ -98,6 +98,8 @@ def make_vehicle_setup(setup: AgentSetup, ports: Ports) -> VehicleSetup:
         setup.params.autopilot_params,
         setup.sysid,
         state_rate_hz=setup.params.state_machine.state_rate_hz,
+        note=ports.note,
+        originals=setup.originals,
     )
 
 

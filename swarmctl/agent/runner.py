@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
@@ -107,6 +107,7 @@ class AgentProcess:
     vehicle_port: int | None = None  # loopback port of the vehicle; None if unknown
     only_land: bool = False  # land and disarm the vehicle, whatever it is doing, then end
     realtime: bool = False  # ask to be scheduled before other programs
+    originals: Mapping[str, int | float] = field(default_factory=dict)  # of parameters that an ended agent has changed
     identity: str = ""  # name of the host it speaks for; "": messages are not sealed
 
 
@@ -150,6 +151,7 @@ def _fly(
         on_frame=lambda frame: recorder.frame(clock.utc_us(), frame),
         stopwatch_ns=time.perf_counter_ns,
         signing=signing,
+        originals=process.originals,
     )
     if process.realtime:
         granted, spent_s = request_realtime(), time.process_time()

@@ -63,6 +63,7 @@ class AgentSetup:
     volume: FlightVolume | None  # to stay in
     fence_ne_m: tuple[tuple[float, float], ...]  # corners of the geofence; none: no fence
     drift_m: float  # by a gust of `separation.gust_m_s`
+    originals: Mapping[str, int | float]  # of parameters that an ended agent has changed, whose vehicle this one lands
 
     @property
     def peers(self) -> list[int]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from swarmctl.core.types import Command, Verb
 from swarmctl.mavlink.commands import CommandPort, CommandResult
@@ -33,6 +33,8 @@ class VehicleSetup:
         setup: parameters to set, name -> value.
         sysid: system id of the agent, which its heartbeats carry.
         state_rate_hz: rate of the messages that carry the state.
+        note: receives the event `parameters_changed` before any is set.
+        originals: values of parameters that an earlier agent has changed, integers where the vehicle stores integers.
 
     Attributes:
         ready: everything has been requested and answered since the last reboot.
@@ -48,15 +50,22 @@ class VehicleSetup:
         sysid: int,
         *,
         state_rate_hz: float,
+        note: Callable[..., None],
+        originals: Mapping[str, int | float] | None = None,
     ) -> None:
         self._autopilot, self._commands = autopilot, commands
         self._given, self._setup, self._rate_hz = dict(setup), dict(setup), state_rate_hz
-        self._sysid = sysid
+        self._sysid, self._note = sysid, note
         self._boots = -1
         self._dialect: Dialect | None = None
         self._todo: deque[Command] = deque()
         self._compared = False  # read values have been compared with wanted ones
-        self._before: dict[str, Command] = {}  # parameter -> command that restores its original value
+        self._before = {  # parameter -> command that restores its original value
+            name: Command(verb=Verb.PARAM_INT, number=value, name=name)
+            if isinstance(value, int)
+            else Command(verb=Verb.PARAM_FLOAT, value=value, name=name)
+            for name, value in (originals or {}).items()
+        }
         self.restore_from_us: int | None = None
         self._open: Command | None = None
         self._failed: dict[str, str] = {}  # parameter -> answer of the autopilot
@@ -81,9 +90,12 @@ class VehicleSetup:
         return "; ".join(sorted(problem for problem in found if problem))
 
     @property
-    def left_changed(self) -> dict[str, float]:
-        """Parameters that could not be restored, with their original values."""
-        return {name: set_back.value or float(set_back.number) for name, set_back in self._before.items()}
+    def left_changed(self) -> dict[str, int | float]:
+        """Parameters that are not restored, with their original values, integers where the vehicle stores integers."""
+        return {
+            name: set_back.number if set_back.verb is Verb.PARAM_INT else set_back.value
+            for name, set_back in self._before.items()
+        }
 
     def restore(self, now_us: int) -> None:
         """Begin to restore every changed parameter; the vehicle has just been heard disarmed, or is handed back.
@@ -99,8 +111,9 @@ class VehicleSetup:
             return
         self._open = None
         name = result.command.name
-        if name and self.restore_from_us is not None:
-            self._before.pop(name if result.ok else "", None)
+        if self.restore_from_us is not None:
+            if result.ok and result.command == self._before.get(name):  # neither read nor set for the flight
+                del self._before[name]
         elif name and not result.ok:
             self._failed[name] = result.text
 
@@ -134,6 +147,9 @@ class VehicleSetup:
         if self._dialect.heeds_parameter:
             self._setup[self._dialect.heeds_parameter] = self._sysid
         self._watched_us, self._samples = now_us, autopilot.states.count
+        if self.restore_from_us is not None:  # the flight is over: nothing else is needed any more
+            self._todo = deque(reversed(self._before.values()))
+            return
         origin = [Command(verb=Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)]
         reads = [Command(verb=Verb.PARAM_GET, name=n) for n in dict.fromkeys((*self._setup, *self._dialect.to_read()))]
         self._todo = deque(self._rates(self._dialect) + origin + reads)
@@ -148,6 +164,8 @@ class VehicleSetup:
             if name in told and not math.isclose(told[name], value, rel_tol=1e-6, abs_tol=1e-9):
                 self._before.setdefault(name, self._setting(name, told[name]))
                 self._todo.append(self._setting(name, value))
+        if self._todo:
+            self._note("parameters_changed", were=self.left_changed)
 
     def _rates(self, dialect: Dialect) -> list[Command]:
         state = [Command(verb=Verb.RATE, value=self._rate_hz, number=number) for number in dialect.state]

@@ -204,6 +204,9 @@ def agent(
         int | None, typer.Option("--vehicle-port", help="Loopback port of the vehicle on that link.")
     ] = None,
     only_land: Annotated[bool, typer.Option("--only-land", help="Land and disarm the vehicle, then exit.")] = False,
+    originals: Annotated[
+        str, typer.Option("--originals", metavar="JSON", help="Parameters to set back that an ended agent has changed.")
+    ] = "{}",
     realtime: Annotated[
         bool, typer.Option(help="Be scheduled before other programs once it is ready, where that is permitted.")
     ] = False,
@@ -212,7 +215,12 @@ def agent(
     """Run one agent, whose vehicle and bus are there already. `launch` and `host` start agents."""
     from swarmctl.agent.runner import AgentProcess, run_agent
     from swarmctl.process_lifetime import PARENT_ENV, die_with_parent
+    from swarmctl.telemetry.recording.changed_parameters import decode_originals
 
+    try:
+        were = decode_originals(originals)
+    except ValueError as error:
+        raise ConfigError("--originals", [str(error)]) from error
     if PARENT_ENV in os.environ:
         die_with_parent(signal.SIGTERM)
     return run_agent(
@@ -225,6 +233,7 @@ def agent(
             fd=fd,
             vehicle_port=vehicle_port,
             only_land=only_land,
+            originals=were,
             realtime=realtime,
             identity=identity,
         )

@@ -22,9 +22,11 @@ import pytest
 import swarmctl
 from swarmctl.config import load
 from swarmctl.core.types import Phase
+from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.signing.key_file import write_new_key
 from swarmctl.mavlink.signing.refusals import OLD, REPLAYED
 from swarmctl.ops.cli import main
+from swarmctl.ops.decide.inputs import frames_of
 from swarmctl.ops.processes import wants_realtime
 from swarmctl.ops.running_launches import LAUNCH_FILE
 from swarmctl.process_priority import is_realtime_permitted
@@ -108,6 +110,9 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start, tmp
     assert {(0, 0), (1, 137), (2, 0)} <= set(ended)
     assert (1, 130) in ended, "its vehicle was landed by another agent"
     assert "the vehicle of agent-1 is on the ground and disarmed" in launched.text()
+    assert launched.events("parameters_changed", "agent-1")[0]["were"]["NAV_DLL_ACT"] == 0
+    told = values_told(launched.run_dir / "recovery" / "agent-1.tlog", "NAV_DLL_ACT")
+    assert (told[0] != 0, told[-1]) == (True, 0), "set for the flight, and by the other agent to what it was before"
     summary = launched.summary()
     assert summary["outcome"] == "failed"
     assert any("agent-1" in violation for violation in summary["violations"])
@@ -125,6 +130,16 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start, tmp
     assert len(list((launched.temp / "state" / "swarmctl" / "signing").iterdir())) == 3
     for agent in ("agent-0", "agent-2"):
         assert 1 in [row["peer"] for row in launched.events("operator", agent)], "the launch has seen it end"
+
+
+def values_told(tlog: Path, name: str) -> list[float]:
+    """Return the values of a parameter that a vehicle has told, in the bits of floats."""
+    codec, found = Codec(255, 190), list[float]()
+    for _, frame in frames_of(tlog.read_bytes()):
+        message = codec.decode(frame)
+        if message is not None and message.get_type() == "PARAM_VALUE" and message.param_id == name:
+            found.append(message.param_value)
+    return found
 
 
 def ctrl_c_lands_and_sums_up(start: Start) -> None:

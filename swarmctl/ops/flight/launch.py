@@ -47,10 +47,12 @@ from swarmctl.ops.processes import (
 )
 from swarmctl.ops.running_launches import RunningLaunch, announce, process_start_s, withdraw
 from swarmctl.ops.supervision.launch_result import LaunchResult
-from swarmctl.ops.supervision.status_table import open_display
+from swarmctl.ops.supervision.status_table import open_display, tell
 from swarmctl.ops.supervision.supervisor import FlightSupervisor, Services
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.process_priority import is_realtime_permitted
+from swarmctl.telemetry.json_safe import to_json
+from swarmctl.telemetry.recording.changed_parameters import read_originals
 from swarmctl.telemetry.recording.event_log import EventLog
 from swarmctl.wall_clock import utc_us
 
@@ -254,7 +256,17 @@ class Launcher(Services):
         ends = self._reserved.sockets[own], self._reserved.vehicle_sockets[own]
         config_path = self.context.directory / "config.toml"
         (command,) = agent_commands(self._config, context, *ends, config_path=config_path)
-        return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
+        return Child(replace(command, argv=(*command.argv, "--only-land", *self._originals(agent))), directory)
+
+    def _originals(self, agent: int) -> tuple[str, ...]:
+        """Return the arguments by which another agent knows the parameters to set back; say so where they are lost."""
+        try:
+            were = read_originals(self.context.directory, agent_name(agent))
+        except (OSError, ValueError) as error:
+            text = f"the vehicle of {agent_name(agent)} may keep the parameters of this flight: {error}"
+            tell(self.log, self.display, "parameters_unknown", text)
+            return ()
+        return ("--originals", to_json(were))
 
     def announce(self, view: str) -> None:
         """Publish this launch to the operator's commands."""

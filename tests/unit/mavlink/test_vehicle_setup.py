@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import struct
 from typing import Any
@@ -12,11 +13,12 @@ from pymavlink.dialects.v20 import development as mavlink
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import Command, FlightMode, GeoOrigin, Landed, Verb
 from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.commands import CommandPort
+from swarmctl.mavlink.commands import CommandPort, CommandResult
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.mavlink.vehicle.autopilot import Autopilot
 from swarmctl.mavlink.vehicle_setup import VehicleSetup
+from swarmctl.telemetry.json_safe import to_json
 
 HOME = GeoOrigin(47.397742, 8.545594, 489.4)
 PX4, ARDUCOPTER = 12, 3
@@ -45,8 +47,9 @@ class Vehicle:
         self.pilot = Autopilot(self.ours, Codec(1, 191), 1, HOME, on_frame=lambda frame: None)
         self.port = CommandPort(self.pilot.send_frame, Codec(1, 191), 1, lambda: self.pilot.dialect)
         self.pilot.connect(self.port)
-        self.setup: dict[str, int | float] = {}
-        self.vehicle_setup = VehicleSetup(self.pilot, self.port, self.setup, 1, state_rate_hz=50.0)
+        self.originals: dict[str, int | float] = {}  # that the next agent is told
+        self.noted: list[tuple[str, dict[str, Any], dict[str, float]]] = []  # and the parameters at that moment
+        self.set_up()
 
     def boot(self) -> None:
         self.booted_us = self.clock.now_us()
@@ -54,8 +57,13 @@ class Vehicle:
         self.asked: list[tuple[int, float]] = []
 
     def set_up(self, **setup: int | float) -> Vehicle:
-        self.vehicle_setup = VehicleSetup(self.pilot, self.port, setup, 1, state_rate_hz=50.0)
+        self.vehicle_setup = VehicleSetup(
+            self.pilot, self.port, setup, 1, state_rate_hz=50.0, note=self._note, originals=self.originals
+        )
         return self
+
+    def _note(self, name: str, **fields: Any) -> None:
+        self.noted.append((name, fields, dict(self.params)))
 
     @property
     def stamp_us(self) -> int:
@@ -250,6 +258,72 @@ def test_a_parameter_that_could_not_be_set_back_is_named_with_its_value() -> Non
     vehicle.vehicle_setup.restore(vehicle.clock.now_us())
     vehicle.run(3.0)
     assert (vehicle.vehicle_setup.restored, vehicle.vehicle_setup.left_changed) == (True, {"NAV_DLL_ACT": 0})
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "came_with"),
+    [
+        (PX4, {"NAV_DLL_ACT": 0, "COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": 4}),
+        (ARDUCOPTER, {"FS_GCS_ENABLE": 0, "SYSID_MYGCS": 255, "FS_GCS_TIMEOUT": 9.0, "GUID_OPTIONS": 8}),
+    ],
+    ids=["PX4", "ArduCopter"],
+)
+def test_what_an_agent_changes_is_noted_before_and_set_back_by_another(
+    autopilot: int, came_with: dict[str, float]
+) -> None:
+    wanted: dict[str, float] = {"COM_OF_LOSS_T": 0.5} if autopilot == PX4 else {"FS_GCS_ENABLE": 5, "FS_GCS_TIMEOUT": 2}
+    vehicle = Vehicle(autopilot, **came_with).set_up(**wanted).run(30.0)
+    ((name, fields, params),) = vehicle.noted
+    assert (name, came_with.items() <= params.items()) == ("parameters_changed", True), "before the first was set"
+    changed = {name: value for name, value in came_with.items() if vehicle.params[name] != value}
+    assert fields["were"] == changed
+    assert len(changed) >= 2
+    vehicle.originals = json.loads(to_json(fields["were"]))
+    again = vehicle.set_up(**wanted)  # the first is killed
+    vehicle.run(30.0)
+    assert len(vehicle.noted) == 1, "nothing was to be changed"
+    again.vehicle_setup.restore(vehicle.clock.now_us())
+    vehicle.run(4.0)
+    assert came_with.items() <= vehicle.params.items()
+    assert (again.vehicle_setup.restored, again.vehicle_setup.left_changed) == (True, {})
+
+
+def test_another_agent_sets_back_also_what_it_has_had_no_time_to_read() -> None:
+    vehicle = Vehicle(NAV_DLL_ACT=3, COM_OF_LOSS_T=0.5)
+    vehicle.originals = {"NAV_DLL_ACT": 0, "COM_OF_LOSS_T": 1.0}
+    vehicle.set_up()
+    vehicle.vehicle_setup.restore(vehicle.clock.now_us())  # the vehicle is on the ground and disarmed
+    assert vehicle.vehicle_setup.left_changed == {"NAV_DLL_ACT": 0, "COM_OF_LOSS_T": 1.0}
+    vehicle.run(3.0)
+    assert (vehicle.params["NAV_DLL_ACT"], vehicle.params["COM_OF_LOSS_T"]) == (0, 1.0)
+    assert vehicle.vehicle_setup.left_changed == {}
+
+
+def test_a_reboot_while_parameters_are_set_back_leaves_none_changed() -> None:
+    vehicle = Vehicle(NAV_DLL_ACT=0, COM_DL_LOSS_T=10).set_up().run(4.0)
+    assert (vehicle.params["NAV_DLL_ACT"], vehicle.params["COM_DL_LOSS_T"]) == (3, 5)
+    vehicle.boot()
+    vehicle.rates_hz = {331: 30.0}
+    while vehicle.pilot.clock.boots == 0:  # which ends the mission
+        vehicle._tick()
+        vehicle.pilot.poll(vehicle.clock.now_us())
+        vehicle.clock.advance(20_000)
+    vehicle.vehicle_setup.restore(vehicle.clock.now_us())
+    vehicle.run(4.0)
+    assert vehicle.vehicle_setup.restored
+    assert (vehicle.params["NAV_DLL_ACT"], vehicle.params["COM_DL_LOSS_T"]) == (0, 10)
+    assert vehicle.vehicle_setup.left_changed == {}
+
+
+def test_only_what_was_set_back_counts_as_restored() -> None:
+    vehicle = Vehicle(NAV_DLL_ACT=0).set_up().run(4.0)
+    setup = vehicle.vehicle_setup
+    setup.restore(vehicle.clock.now_us())
+    wanted = Command(verb=Verb.PARAM_INT, number=3, name="NAV_DLL_ACT")
+    for command in (Command(verb=Verb.PARAM_GET, name="NAV_DLL_ACT"), wanted):
+        setup._open = command  # asked before, and answered now
+        setup.on_result(CommandResult(command, True, "3"))
+        assert setup.left_changed == {"NAV_DLL_ACT": 0}
 
 
 def test_after_a_reboot_everything_is_asked_for_again() -> None:

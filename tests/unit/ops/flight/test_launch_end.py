@@ -6,7 +6,8 @@ import errno
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -25,6 +26,7 @@ from swarmctl.ops.orders.obstacle_list import read_obstacles
 from swarmctl.ops.orders.operator import joined, read_statuses
 from swarmctl.ops.orders.order_delivery import deliver
 from swarmctl.ops.preflight import ReservedPorts
+from swarmctl.ops.processes import ROUTER
 from swarmctl.ops.running_launches import RunningLaunch, announce, find_launch
 from swarmctl.ops.supervision.launch_result import LaunchResult
 
@@ -97,9 +99,9 @@ def test_a_verb_that_finds_a_launch_in_its_last_moment_says_that_it_is_ending(
         pass
 
 
-def launcher(folder: Path) -> Launcher:
+def launcher(folder: Path, agents: tuple[int, ...] = ()) -> Launcher:
     ports = ReservedPorts(sockets=(), ports=(), view_port=0)
-    return Launcher(Config(), LaunchOptions(), ports, folder, part=SwarmPart(run="circle-1a", agents=()))
+    return Launcher(Config(), LaunchOptions(), ports, folder, part=SwarmPart(run="circle-1a", agents=agents))
 
 
 def test_a_launch_is_ending_from_the_end_of_its_agents_until_its_report_is_written(
@@ -139,3 +141,32 @@ def test_an_end_that_can_not_be_announced_is_one_all_the_same(monkeypatch: pytes
     monkeypatch.setattr(launching, "announce", no_descriptor)
     services.stop(0.0)
     assert len(ended) == 3, "agents, others, router"
+
+
+@pytest.mark.parametrize(
+    ("events", "arguments", "said"),
+    [
+        ('{"event":"parameters_changed","were":{"NAV_DLL_ACT":0}}\n', ("--originals", '{"NAV_DLL_ACT": 0}'), ""),
+        (None, (), "the vehicle of agent-0 may keep the parameters of this flight: "),
+        ('{"event":"parameters_changed","were":{"NAV_DLL_ACT":"x"}}\n', (), "the vehicle of agent-0 may keep"),
+    ],
+    ids=["told", "lost", "damaged"],
+)
+def test_who_lands_the_vehicle_of_another_agent_is_told_what_its_parameters_were(
+    events: str | None,
+    arguments: tuple[str, ...],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    if events is not None:
+        (tmp_path / "agent-0.events.jsonl").write_text(events)
+    monkeypatch.setattr(launching, "Child", lambda command, directory: command)
+    services = launcher(tmp_path, agents=(0,))
+    services.children[ROUTER] = cast(Any, SimpleNamespace(poll=lambda: None))
+    command = cast(Any, services.recover(0))
+    assert command.argv[command.argv.index("--only-land") + 1 :] == arguments
+    assert capsys.readouterr().out.startswith(said)
+    services.children.clear()
+    services.stop(0.0)
