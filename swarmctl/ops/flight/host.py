@@ -7,7 +7,7 @@ are on other keys of the bus, even where their routers are linked, and computers
 from __future__ import annotations
 
 import hashlib
-import shlex
+import re
 import sys
 from collections.abc import Sequence
 from ipaddress import IPv4Address, IPv6Address
@@ -113,10 +113,17 @@ def _addresses(config: Config) -> dict[str, IPv4Address | IPv6Address | None]:
     return {**{host.name: ip_of(host.address) for host in config.hosts}, STATION: None}
 
 
-def systemd_unit(path: Path, host: HostParams) -> str:
-    """Return a unit that flies the agents of a host when it is started, and lands them when it is stopped."""
+def systemd_unit(path: Path, host: HostParams, overrides: Sequence[str] = ()) -> str:
+    """Return a unit that flies the agents of a host when it is started, and lands them when it is stopped.
+
+    Args:
+        path: configuration of the swarm.
+        host: the host.
+        overrides: keys that are set besides, which have to be the same on every computer.
+    """
     agents = ",".join(map(str, host.agents))
-    command = (sys.executable, "-m", "swarmctl", "host", "--config", str(path.resolve()), "--agents", agents)
+    options = ("--config", str(path.resolve()), "--agents", agents, *(f"--set={override}" for override in overrides))
+    command = " ".join(_unit_word(word) for word in (sys.executable, "-m", "swarmctl", "host", *options))
     return f"""# Start it by hand, or by a program of yours: it arms and takes off as soon as the whole swarm is ready.
 # So it has no [Install] section, by which it would fly at every boot, and it is not restarted.
 [Unit]
@@ -125,7 +132,7 @@ Wants=network-online.target
 After=network-online.target
 
 [Service]
-ExecStart={shlex.join(command)}
+ExecStart={command}
 WorkingDirectory=%h
 Restart=no
 KillMode=mixed
@@ -133,6 +140,15 @@ KillSignal=SIGINT
 TimeoutStopSec=180
 LimitRTPRIO=20
 """
+
+
+def _unit_word(word: str) -> str:
+    """Return a word as systemd reads it back: its quotes and escapes are not those of a shell."""
+    literal = word.replace("%", "%%").replace("$", "$$")
+    if re.fullmatch(r"[\w%$@=+:,./-]+", literal):
+        return literal
+    escaped = literal.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
+    return f'"{escaped}"'
 
 
 def refuse_unidentified(config: Config, name: str) -> None:

@@ -40,7 +40,10 @@ def host(
         raise ConfigError("--agents", [f"{agents!r}: write numbers with commas between them, as 0,1"]) from error
     loaded, own = load_host(config, numbers, sets or ())
     if print_unit:
-        print(systemd_unit(config, own), end="")
+        if run_dir is not None:
+            problem = "a unit is started more than once, and a second flight would find the folder taken; leave it out"
+            raise ConfigError("--run-dir", [problem])
+        print(systemd_unit(config, own, sets or ()), end="")
         return EXIT_OK
     return fly_host(loaded, own, LaunchOptions(run_dir))
 

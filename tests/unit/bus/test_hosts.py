@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import stat
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.config import load, own_identity
 from swarmctl.errors import ConfigError
 from swarmctl.files import create_private
+from swarmctl.ops.cli import main
 from swarmctl.ops.flight.host import (
     add_host_identity,
     load_host,
@@ -131,6 +133,25 @@ def test_the_unit_lands_when_it_is_stopped_and_does_not_fly_at_boot(path: Path) 
     assert f"host --config {path} --agents 2,3" in unit
     assert {"KillSignal=SIGINT", "Restart=no"} <= set(unit.splitlines())
     assert "\n[Install]" not in unit
+
+
+def test_the_unit_sets_what_was_set(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_host_identities(path)
+    sets = ["agent.rate_hz=25", r"""name='50%-$HOME \d "x"'"""]
+    print(systemd_unit(path, load_host(path, [2, 3])[1], sets))
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("ExecStart=")]
+    assert line.endswith(r"""--agents 2,3 --set=agent.rate_hz=25 "--set=name='50%%-$$HOME \\d \"x\"'" """.rstrip())
+    monkeypatch.setattr(sys, "argv", ["swarmctl", "host", "--config", str(path), "--agents", "2,3", "--print-unit"])
+    sys.argv += ["--set", sets[0]]
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main()
+    assert "--agents 2,3 --set=agent.rate_hz=25\n" in capsys.readouterr().out
+    sys.argv += ["--run-dir", "runs/mine"]
+    with pytest.raises(SystemExit, match=r"^2$"):
+        main()
+    assert "--run-dir: a unit is started more than once" in capsys.readouterr().err
 
 
 def test_a_revoked_identity_is_refused_until_the_host_has_a_new_one(path: Path) -> None:
