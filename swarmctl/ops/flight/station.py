@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -27,7 +27,8 @@ from swarmctl.ops.flight.launch import LaunchOptions, SwarmPart, judged, started
 from swarmctl.ops.processes import ROUTER, VIEWER
 from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.launch_result import LaunchResult
-from swarmctl.ops.supervision.status_table import AgentView, Display, tell
+from swarmctl.ops.supervision.recovery import RECOVERY_S
+from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
@@ -35,6 +36,8 @@ from swarmctl.telemetry.recording.recorder import Recorder
 
 _STEP_S = 0.05
 _GONE_S = 3.0  # an agent that was done and is silent for so long has ended
+_SILENT_S = 5.0  # an agent in flight that is silent for so long when the station is ended counts as lost; 25 statuses
+_PAUSE_S = 0.5  # of the station itself
 
 
 def run_station(config: Config, options: LaunchOptions) -> int:
@@ -107,12 +110,16 @@ class SwarmWatch:
         self._obstacles_version: int | None = None
         self._views = [AgentView(agent=agent) for agent in range(agents)]
         self._recorders = {agent_name(agent): Recorder(directory, agent) for agent in range(agents)}
+        self._flying: set[int] = set()  # agents that were heard between the beginning and the end of a flight
+        self._stepped_s = clock_s()
+        self._is_over = False
         self.problems: list[str] = []
         self.was_stopped = False
 
     def step(self) -> bool:
-        """Show and record what has arrived; returns whether every agent was done and has ended."""
+        """Show and record what has arrived; returns whether every agent was done and has ended, or is lost."""
         now_s = self._clock_s()
+        self._excuse_own_pause(now_s)
         for sender, payload in self._bus.receive(TICK):
             tick = unpack_tick(payload)
             if tick is not None:
@@ -121,6 +128,8 @@ class SwarmWatch:
             if 0 <= status.agent < len(self._views):
                 view = self._views[status.agent]
                 view.status, view.received_s = status, now_s
+                if status.armed or Phase.STANDBY < status.phase < Phase.DONE:
+                    self._flying.add(status.agent)
         for _, payload in self._bus.receive(OBSTACLES):
             message = decode_obstacles(payload)
             if message is not None and message.replaces(self._obstacles_version):
@@ -128,20 +137,45 @@ class SwarmWatch:
                 self._note("obstacles", **recorded_list(message))
         self._report.step()
         self._display.show(self._views)
-        over = all(self._has_ended(view, now_s) for view in self._views)
-        if over:
-            outcomes = {view.agent: view.status.outcome for view in self._views if view.status is not None}
-            self.was_stopped = OPERATOR_STOP in outcomes.values()
-            for agent, outcome in outcomes.items():
-                if outcome not in ("completed", OPERATOR_STOP):
-                    self.problems.append(f"{agent_name(agent)} failed: {outcome or 'no reason given'}")
-        return over
+        lost = self._lost(now_s, RECOVERY_S)  # a host that lives would have landed its vehicle meanwhile
+        self._is_over = all(self._has_ended(view, now_s) or view.agent in lost for view in self._views)
+        if self._is_over:
+            self._conclude(lost)
+        return self._is_over
 
     def close(self) -> None:
-        """Write what is still to be recorded."""
+        """Write what is still to be recorded; who is silent in flight and not waited for any longer counts as lost."""
+        if not self._is_over:
+            self.problems += self._lost(self._clock_s(), _SILENT_S).values()
         for recorder in self._recorders.values():
             recorder.close()
 
     def _has_ended(self, view: AgentView, now_s: float) -> bool:
         done = view.status is not None and view.status.phase == Phase.DONE
         return done and now_s - view.received_s > _GONE_S
+
+    def _lost(self, now_s: float, silent_s: float) -> dict[int, str]:
+        """Return which agents were flying and are silent for longer than `silent_s`, in words."""
+        return {
+            view.agent: f"{agent_name(view.agent)} was lost in {name_of(Phase, view.status.phase)}: "
+            f"nothing was heard of it for {now_s - view.received_s:.0f} s"
+            for view in self._views
+            if view.status is not None and view.agent in self._flying and view.status.phase != Phase.DONE
+            if now_s - view.received_s >= silent_s
+        }
+
+    def _conclude(self, lost: Mapping[int, str]) -> None:
+        """Tell the ends of all agents."""
+        self.problems += lost.values()
+        outcomes = {v.agent: v.status.outcome for v in self._views if v.status is not None and v.agent not in lost}
+        self.was_stopped = OPERATOR_STOP in outcomes.values()
+        for agent, outcome in outcomes.items():
+            if outcome not in ("completed", OPERATOR_STOP):
+                self.problems.append(f"{agent_name(agent)} failed: {outcome or 'no reason given'}")
+
+    def _excuse_own_pause(self, now_s: float) -> None:
+        """Count no time in which this process itself did not run: nobody was lost in it."""
+        paused_s, self._stepped_s = now_s - self._stepped_s, now_s
+        if paused_s > _PAUSE_S:
+            for view in self._views:
+                view.received_s += paused_s if view.status is not None else 0.0

@@ -1,19 +1,26 @@
-"""What a station records of a swarm that flies elsewhere, besides ticks."""
+"""What a station records of a swarm that flies elsewhere, besides ticks, and when it ends."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from io import StringIO
 from pathlib import Path
 from typing import Any
+
+import msgspec
+import pytest
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.messages.json_messages import encode_message, first_list
 from swarmctl.bus.topics import OBSTACLES, STATUS, TICK
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.types import Phase
 from swarmctl.ops.flight.station import SwarmWatch
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
+from tests.builders import status_message
 
 BALL = Obstacle(center_ned_m=(5.0, 0.0, -2.0), radius_m=0.5, keep_out_m=1.0)
 
@@ -36,3 +43,97 @@ def test_lists_of_obstacles_are_recorded_once_for_the_referee(tmp_path: Path) ->
     assert [row["version"] for row in noted] == [1, 2, 3]
     (judged,) = recorded_obstacles((), noted)
     assert (judged.obstacle, judged.since_utc_us, judged.until_utc_us) == (BALL, 2_000_000, 3_000_000)
+
+
+class Watched:
+    """A station that watches three agents, on a scripted clock."""
+
+    def __init__(self, folder: Path) -> None:
+        self.now_s = 1000.0
+        self._hub = LocalHub(lambda: round(1e6 * self.now_s))
+        names = [agent_name(agent) for agent in range(3)]
+        self._agents = [self._hub.connect(name) for name in names]
+        bus = self._hub.connect("station", {STATUS: names, TICK: names, OBSTACLES: []})
+        self.watch = SwarmWatch(bus, 3, folder, PlainLines(StringIO()), lambda *_, **__: None, lambda: self.now_s)
+
+    def run(self, seconds: float, phases: dict[int, Phase], armed: bool = True) -> bool:
+        """Return whether the station ends while agents report these phases; the others are silent."""
+        for _ in range(round(seconds / 0.2)):
+            for agent, phase in phases.items():
+                status = status_message(agent=agent, phase=phase)
+                done = msgspec.structs.replace(status, armed=False, outcome="completed")
+                status = done if phase == Phase.DONE else msgspec.structs.replace(status, armed=armed, outcome="")
+                self._agents[agent].publish(STATUS, encode_message(status))
+            if self.watch.step():
+                return True
+            self.now_s += 0.2
+        return False
+
+
+@pytest.fixture
+def watched(tmp_path: Path) -> Iterator[Watched]:
+    station = Watched(tmp_path)
+    yield station
+    station.watch.close()
+
+
+ALL_TRACK = dict.fromkeys(range(3), Phase.TRACK)
+LOST = "agent-1 was lost in TRACK: nothing was heard of it for 90 s"
+
+
+def test_a_station_ends_without_an_agent_that_was_lost_in_flight_and_says_so(watched: Watched) -> None:
+    assert not watched.run(5.0, ALL_TRACK)
+    assert not watched.run(80.0, {0: Phase.TRACK, 2: Phase.TRACK})
+    assert not watched.run(6.0, {0: Phase.DONE, 2: Phase.DONE})
+    assert not watched.run(3.8, {}), "89.8 s"
+    assert watched.run(0.4, {})
+    watched.watch.close()
+    assert watched.watch.problems == [LOST]
+
+
+def test_who_is_heard_again_is_not_lost(watched: Watched) -> None:
+    assert not watched.run(5.0, ALL_TRACK)
+    assert not watched.run(120.0, {0: Phase.TRACK, 2: Phase.TRACK})
+    assert not watched.run(5.0, ALL_TRACK)
+    assert not watched.run(2.0, dict.fromkeys(range(3), Phase.DONE))
+    assert watched.run(5.0, {})
+    assert watched.watch.problems == []
+
+
+def test_who_was_heard_on_the_ground_alone_is_waited_for(watched: Watched) -> None:
+    assert not watched.run(2.0, dict.fromkeys(range(3), Phase.STANDBY), armed=False)
+    assert not watched.run(2.0, {0: Phase.DONE, 2: Phase.DONE})
+    assert not watched.run(200.0, {})
+    watched.watch.close()
+    assert watched.watch.problems == []
+
+
+def test_who_armed_without_order_is_lost_too(watched: Watched) -> None:
+    assert not watched.run(2.0, dict.fromkeys(range(3), Phase.STANDBY))
+    assert watched.run(95.0, {})
+    assert [line.split(":")[0] for line in watched.watch.problems] == [
+        f"agent-{i} was lost in STANDBY" for i in range(3)
+    ]
+
+
+def test_ctrl_c_names_who_is_silent_in_flight(watched: Watched) -> None:
+    assert not watched.run(5.0, ALL_TRACK)
+    assert not watched.run(12.0, {0: Phase.TRACK, 2: Phase.DONE})
+    watched.watch.close()
+    assert watched.watch.problems == ["agent-1 was lost in TRACK: nothing was heard of it for 12 s"]
+
+
+def test_ctrl_c_names_nobody_who_is_unheard_for_a_moment(watched: Watched) -> None:
+    assert not watched.run(5.0, ALL_TRACK)
+    assert not watched.run(4.0, {0: Phase.TRACK})
+    watched.watch.close()
+    assert watched.watch.problems == []
+
+
+def test_nobody_is_lost_while_the_station_itself_stands_still(watched: Watched) -> None:
+    assert not watched.run(5.0, ALL_TRACK)
+    assert not watched.run(1.0, {})
+    watched.now_s += 600.0
+    assert not watched.run(1.0, {})
+    watched.watch.close()
+    assert watched.watch.problems == []
