@@ -13,14 +13,15 @@ from pymavlink.dialects.v20 import development as mav
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION
 from tests.benches.launches import Launched
-from tests.real.autopilots import PX4
+from tests.real.autopilots import ARDUCOPTER, PX4, Kind
 from tests.real.conftest import Field, Fielder
-from tests.real.test_flights import BODIES_M, END_S, GROUND_S, PX4_CONFIG
+from tests.real.test_flights import ARDUPILOT_CONFIG, BODIES_M, END_S, GROUND_S, LONE_PX4, PX4_CONFIG, booted
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 
 LOITER, OFFBOARD = 0x03040000, 0x00060000
 PHASES = ("CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND", "LAND")
+CLIMBED_M, START_HEIGHT_M = 0.5, 2.0
 STOPPED_S = 60.0  # within which nothing is armed any more, or it is named
 
 
@@ -65,6 +66,21 @@ def test_a_pilot_has_the_vehicle_until_resume(field: Fielder) -> None:
     assert launched.end(END_S) == 0, launched.text()
     here.witness.wait(here.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
     assert here.witness.min_separation_m() > BODIES_M
+
+
+@pytest.mark.parametrize(("kind", "land"), [(PX4, (4, 6)), (ARDUCOPTER, (9, 0))], ids=["px4", "arducopter"])
+def test_what_a_pilot_lands_while_it_takes_off_stays_down(field: Fielder, kind: Kind, land: tuple[int, int]) -> None:
+    here = field(PX4, 1) if kind is PX4 else booted(field, 1)
+    launched = here.launch(*((PX4_CONFIG, *LONE_PX4) if kind is PX4 else (ARDUPILOT_CONFIG,)))
+    launched.until_phase("TAKEOFF", 1)
+    vehicle = here.witness.vehicles[0]
+    here.witness.wait(lambda: vehicle.height_m() > CLIMBED_M, 30.0, "climbing")
+    here.witness.command(0, mav.MAV_CMD_DO_SET_MODE, 1, *land)
+    here.witness.wait(lambda: not vehicle.armed, 40.0, "landed and disarmed")
+    assert here.witness.highest_m(0) < START_HEIGHT_M - 0.3, "it did not take off again"
+    assert launched.end(END_S) == EXIT_MISSION, launched.text()
+    assert "pilot or autopilot took over" in launched.text()
+    assert not vehicle.armed
 
 
 def test_an_autopilot_that_starts_again_before_arming_is_waited_for(field: Fielder) -> None:
