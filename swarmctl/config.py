@@ -289,7 +289,7 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
     """Yield problems between keys and sections, and of files."""
     agents, separation = config.swarm.agents, config.separation
     yield from _start_problems(config)
-    yield from vehicle_problems(config.vehicles, agents, simulated=config.sitl.enabled)
+    yield from vehicle_problems(config.vehicles, agents, simulated=config.sitl.enabled, hosts=config.hosts)
     yield from host_problems(config.hosts, agents)
     yield from simulated_host_problems(config.hosts if config.sitl.enabled else ())
     yield from forward_problems(config.mavlink.forward)

@@ -133,8 +133,10 @@ def obstacle_problems(
             yield f"obstacles.{i}: {len(inside) - _PAIRS_SHOWN} more starts or goals are within its keep_out_m"
 
 
-def vehicle_problems(vehicles: Sequence[VehicleParams], agents: int, *, simulated: bool) -> Iterator[str]:
-    """Yield what is wrong with the list of vehicles to fly."""
+def vehicle_problems(
+    vehicles: Sequence[VehicleParams], agents: int, *, simulated: bool, hosts: Sequence[HostParams]
+) -> Iterator[str]:
+    """Yield what is wrong with the list of vehicles to fly; each host has devices and ports of its own."""
     if not vehicles:
         if not simulated:
             yield "vehicles: empty while sitl.enabled = false; list one [[vehicles]] with sysid and url for each agent"
@@ -147,6 +149,7 @@ def vehicle_problems(vehicles: Sequence[VehicleParams], agents: int, *, simulate
     if len(vehicles) < agents:
         yield f"vehicles: {len(vehicles)} listed for swarm.agents = {agents}; list one for each agent"
     seen_sysids: dict[int, int] = {}
+    host_of = {agent: host.name for host in hosts for agent in host.agents}
     links: list[Endpoint | None] = []
     for i, vehicle in enumerate(vehicles):
         try:
@@ -154,7 +157,8 @@ def vehicle_problems(vehicles: Sequence[VehicleParams], agents: int, *, simulate
         except ValueError as error:
             yield f"vehicles.{i}.url = {error}"
             link = None
-        rivals = [k for k, other in enumerate(links) if link and other and _same_place(link, other)]
+        beside = [(k, other) for k, other in enumerate(links) if host_of.get(k) == host_of.get(i)]
+        rivals = [k for k, other in beside if link and other and _same_place(link, other)]
         links.append(link)
         if rivals:
             yield (

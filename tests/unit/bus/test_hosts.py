@@ -62,6 +62,18 @@ def test_what_is_no_list_of_hosts_is_refused(item: str, words: str) -> None:
     assert words in str(refused.value)
 
 
+def with_devices(*devices: str) -> list[str]:
+    """Return overrides by which the six vehicles of three hosts are at these devices, in turn on each host."""
+    links = ",".join(f'{{sysid={i + 1},url="serial:///dev/{devices[i % 2]}:921600"}}' for i in range(6))
+    return ["sitl.enabled=false", f"vehicles=[{links}]"]
+
+
+def test_each_host_has_devices_of_its_own() -> None:
+    assert len(load(CONFIG, with_devices("ttyACM0", "ttyACM1"), only_agents=()).vehicles) == 6
+    with pytest.raises(ConfigError, match=r"vehicles\.1\.url.*same port as vehicles\.0"):
+        load(CONFIG, with_devices("ttyACM0", "ttyACM0"), only_agents=())
+
+
 def test_there_is_one_link_for_each_pair_of_hosts_and_the_station_has_one_to_each() -> None:
     config = load(CONFIG)
     hosts = config.hosts
