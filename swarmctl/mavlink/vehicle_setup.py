@@ -61,10 +61,7 @@ class VehicleSetup:
         self._todo: deque[Command] = deque()
         self._compared = False  # read values have been compared with wanted ones
         self._before = {  # parameter -> command that restores its original value
-            name: Command(verb=Verb.PARAM_INT, number=value, name=name)
-            if isinstance(value, int)
-            else Command(verb=Verb.PARAM_FLOAT, value=value, name=name)
-            for name, value in (originals or {}).items()
+            name: _setting(name, value) for name, value in (originals or {}).items()
         }
         self.restore_from_us: int | None = None
         self._open: Command | None = None
@@ -175,9 +172,8 @@ class VehicleSetup:
 
     def _setting(self, name: str, value: float) -> Command:
         """Return the request for a value in the type in which the vehicle stores it."""
-        if name in self._autopilot.whole_params and float(value).is_integer():
-            return Command(verb=Verb.PARAM_INT, number=int(value), name=name)
-        return Command(verb=Verb.PARAM_FLOAT, value=float(value), name=name)
+        is_whole = name in self._autopilot.whole_params and float(value).is_integer()
+        return _setting(name, int(value) if is_whole else float(value))
 
     def _origin(self, now_us: int) -> Command | None:
         frame = self._autopilot.frame
@@ -202,3 +198,10 @@ class VehicleSetup:
         self._watch_us = min(_WATCH_MAX_US, 2 * self._watch_us)
         assert self._dialect is not None
         self._todo.extend(self._rates(self._dialect))
+
+
+def _setting(name: str, value: int | float) -> Command:
+    """Return the request that sets a parameter, as an integer or as a real number."""
+    if isinstance(value, int):
+        return Command(verb=Verb.PARAM_INT, number=value, name=name)
+    return Command(verb=Verb.PARAM_FLOAT, value=value, name=name)

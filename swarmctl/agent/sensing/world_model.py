@@ -364,8 +364,7 @@ class WorldModel:
 
         An agent that was restarted in flight is done at once, while the autopilot still lands its vehicle.
         """
-        stays = not self._flies_in(agent, _MOVES)
-        return self._is_in(agent, Phase.DONE) and stays
+        return self._is_in(agent, Phase.DONE) and not self._flies_in(agent, _MOVES)
 
     def _is_landing(self, agent: int) -> bool:
         """Return whether a peer's vehicle descends, by its agent's order, a pilot's, or by itself."""
@@ -374,5 +373,6 @@ class WorldModel:
     def _flies_in(self, agent: int, modes: Set[FlightMode]) -> bool:
         """Return whether a peer's vehicle flies in one of these modes, as far as its agent has heard."""
         status = self._status.get(agent)
-        flies = status is not None and status.armed and status.landed != Landed.ON_GROUND
-        return flies and status is not None and status.flight_mode in modes
+        if status is None or not status.armed or status.landed == Landed.ON_GROUND:
+            return False
+        return status.flight_mode in modes

@@ -59,7 +59,7 @@ class PathPublisher:
             self._gust.forget()
         else:
             self._gust.update(self._ports.clock.now_us(), disturbance_ned_m_s2)
-        if state is None or not (flown is not None or self._is_recent(state)):
+        if state is None or (flown is None and not self._is_recent(state)):
             return
         margin_m = min(MAX_MARGIN_M, sum((*margins_m, self._gust.margin_m)))
         topic = self._topic()
