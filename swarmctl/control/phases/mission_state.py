@@ -72,6 +72,7 @@ class MissionState:
         outcome_before: outcome before the override, restored by resume.
         first_tick_us: monotonic time from which the patience with the start counts.
         entered_us: monotonic time at which the phase was entered.
+        land_by_us: monotonic time at which a vehicle that is not at its landing place by then lands where it is.
         requested_us: monotonic time of the newest request to the autopilot.
     """
 
@@ -82,7 +83,7 @@ class MissionState:
         self.duration_us = round(setup.duration_s * 1e6)
         self.phase, self.boots = Phase.CONNECT, 0
         self.outcome = self.outcome_before = self.waits_for = self.stop_verb = ""
-        self.ready_utc_us = self.ordered_begin_utc_us = self.entered_us = self.overridden_us = 0
+        self.ready_utc_us = self.ordered_begin_utc_us = self.entered_us = self.overridden_us = self.land_by_us = 0
         self.begin_utc_us: int | None = None
         self.first_tick_us: int | None = None
         self.requested_us = -REQUEST_PERIOD_US
@@ -159,7 +160,7 @@ class MissionState:
         if self.phase < Phase.TRACK:
             return self.params.start_timeout_s - (now_us - self.first_tick_us) * 1e-6
         if self.phase is Phase.GOTO_LAND:
-            return self.params.land_timeout_s - (now_us - self.entered_us) * 1e-6
+            return (self.land_by_us - now_us) * 1e-6
         return self.duration_us * 1e-6 - self.mission_t_s(utc_us)
 
     def control_mode(self, mode: Mode) -> ControlMode:
@@ -221,19 +222,18 @@ class MissionState:
     def go_home(self, now_us: int, state: VehicleState) -> None:
         """Fly to the landing place."""
         self.landing.go_home(now_us, state)
-        self.interruptions.end_hold()
-        self.enter(Phase.GOTO_LAND, now_us)
+        self._begin_landing(now_us)
 
     def stop_in_place(self, now_us: int, state: VehicleState) -> None:
         """Brake and move away from others under the own plan, then let the autopilot land there."""
         self.landing.stop_in_place(now_us, state)
-        self.interruptions.end_hold()
-        self.enter(Phase.GOTO_LAND, now_us)
+        self._begin_landing(now_us)
 
     def go_on(self, now_us: int, utc_us: int, state: VehicleState) -> None:
         """Go on with what was interrupted: the transit, or the mission."""
         if self.phase in (Phase.GOTO_START, Phase.READY, Phase.GOTO_LAND):
             self.trajectories.go_to(self.trajectories.destination_ned_m, now_us, state)
+            self._allow_way(now_us)
         else:
             self.rejoin_mission(now_us, utc_us, state)
 
@@ -241,3 +241,14 @@ class MissionState:
         """Return to the mission's moving reference, if it is under way."""
         if self.phase is Phase.TRACK and self.begin_utc_us is not None:
             self.trajectories.rejoin_mission(self.mission_t_s(utc_us), now_us, state)
+
+    def _begin_landing(self, now_us: int) -> None:
+        self.interruptions.end_hold()
+        self.enter(Phase.GOTO_LAND, now_us)
+        self._allow_way(now_us)
+
+    def _allow_way(self, now_us: int) -> None:
+        """Leave time for all of the way that has begun: a vehicle lands where it is only if something stops it."""
+        way = self.trajectories.current
+        travel_s = way.trajectory.travel_s if way else 0.0
+        self.land_by_us = now_us + round((travel_s + self.params.land_timeout_s) * 1e6)

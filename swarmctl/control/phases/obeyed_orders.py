@@ -101,8 +101,7 @@ def _excuse_waiting(mission: MissionState, now_us: int, since_us: int) -> None:
     """Let timeouts go on as if the time since then had not passed."""
     if mission.first_tick_us is not None:
         mission.first_tick_us += now_us - since_us
-    if mission.phase is Phase.GOTO_LAND:
-        mission.entered_us = now_us
+    mission.land_by_us += now_us - since_us
 
 
 # by verb; stops are in `apply_stop`

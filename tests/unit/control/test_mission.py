@@ -187,6 +187,19 @@ def test_a_glide_that_must_turn_round_stays_near_its_acceleration() -> None:
     assert np.linalg.norm(accel, axis=1).max() < 1.6 * 1.2
 
 
+@pytest.mark.parametrize("target_m", [[50.0, 0.0, -11.5], [0.0, 0.0, -11.5], [-5.0, 200.0, -3.0]])
+def test_a_first_velocity_carries_no_farther_when_the_way_is_long(target_m: list[float]) -> None:
+    # With the acceleration 1.2 m/s^2 that its way on needs at 2.2 m/s: v^2 / a = 4 m, half of it with a steady brake.
+    trajectory = quintic_to(
+        np.array([0.0, 0.0, -11.5]), np.array([0.0, 0.0, 2.2]), np.array(target_m), 2.0, accel_m_s2=1.2
+    )
+    down_m = trajectory.sample(np.linspace(0.0, trajectory.travel_s, 2001))[0][:, 2]
+    assert down_m.max() < max(-11.5, target_m[2]) + 2.5
+    _, velocity, accel = derivatives(trajectory)
+    assert np.linalg.norm(accel, axis=1).max() < 1.6 * 1.2
+    np.testing.assert_allclose(velocity[0], [0.0, 0.0, 2.2], atol=0.01)
+
+
 @pytest.mark.parametrize("speed_m_s", [0.0, 0.3, 2.5, 10.0])
 def test_braking_is_straight_ahead_without_overshoot_and_within_the_acceleration(speed_m_s: float) -> None:
     vel = speed_m_s * np.array([0.6, 0.8, 0.0])

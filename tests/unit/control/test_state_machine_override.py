@@ -195,10 +195,21 @@ def test_a_start_that_takes_too_long_in_the_air_lands() -> None:
 
 
 def test_a_landing_place_that_cannot_be_reached_is_given_up() -> None:
-    flight = controlled(Phase.GOTO_LAND)
-    flight.run(19.0)
+    flight = controlled(Phase.GOTO_LAND)  # 3 m from there, where it stays: 3.8 s at the acceleration of transits
+    flight.run(22.0)
     assert flight.at == "GOTO_LAND"
-    flight.run(2.0)
+    flight.run(3.0)
+    assert flight.at == "LAND"
+
+
+def test_a_way_home_may_take_as_long_as_it_is() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos = START + np.array([150.0, 0.0, 0.0])  # 141 s at 2 m/s
+    assert flight.ask("rtl") == ""
+    flight.run(140.0)
+    assert flight.at == "GOTO_LAND"
+    assert 20.0 < flight.mission.ends_in_s(flight.now_us, flight.utc_us) < 23.0
+    flight.run(25.0)
     assert flight.at == "LAND"
 
 

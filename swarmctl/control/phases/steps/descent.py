@@ -18,10 +18,9 @@ def goto_land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -
     if mission.may_take_control and not mission.had_control:  # a pilot has given it back
         return handover.request_control(mission, inputs, state)
     landing, controls = mission.landing, mission.had_control
-    waited_us = inputs.now_us - mission.entered_us
     if landing.is_reached(inputs, state, controls=controls, paused=mission.interruptions.paused):
         mission.enter(Phase.LAND, inputs.now_us)
-    elif waited_us > mission.params.land_timeout_s * 1e6:
+    elif inputs.now_us > mission.land_by_us:
         if landing.is_possible_here(inputs, state, controls=controls) or inputs.mode not in PLAN_MODES:
             mission.enter(Phase.LAND, inputs.now_us)
         else:
