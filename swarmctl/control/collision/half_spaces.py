@@ -56,7 +56,8 @@ def half_spaces(
     moved = math.dist(guess_ned_m[-1, :axes], guess_ned_m[0, :axes])
     stuck_01 = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
     if stuck_01 or known.obstacles:
-        to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
+        to_goal = np.tile(goal_m - guess_ned_m[1:, :axes], (len(known), 1, 1))
+        to_goal[known.obstacles] -= (others[:, -1:] - others[:, :1])[known.obstacles]  # as seen from a moving one
         angle_rad = _largest_turns(normal, to_goal, known.obstacles, stuck_01, params)
         normal = _with_right_of_way(normal, distance, needed, to_goal, angle_rad=angle_rad)
     if axes == 3:
@@ -106,14 +107,15 @@ def _largest_turns(
 
     Args:
         normal: unit vectors from keep-outs to the guess.
-        to_goal: (Hp, axes) from the guess to the goal.
+        to_goal: (slots, Hp, axes) from the guess to the goal.
         obstacles: slots of obstacles.
         stuck_01: how far the own plan is stuck.
         params: angles.
     """
     angle_rad = np.full(normal.shape[:2], params.right_of_way_rad * stuck_01)
     if obstacles:
-        across = to_goal[:, 0] * normal[obstacles, :, 1] - to_goal[:, 1] * normal[obstacles, :, 0]  # > 0: on the left
+        way, side = to_goal[obstacles], normal[obstacles]
+        across = way[:, :, 0] * side[:, :, 1] - way[:, :, 1] * side[:, :, 0]  # > 0: on the left
         angle_rad[obstacles] = params.right_of_way_obstacle_rad * np.where(across > 0.0, -1.0, 1.0)
     return angle_rad
 
@@ -142,12 +144,13 @@ def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: A
     Peers follow one right-of-way rule: each turns normals clockwise seen from above (as NED yaw), so that two that meet
     head-on both give way to the left. Obstacles are passed on the side the agent is on. `angle_rad` (max_keep_outs, Hp)
     is the largest turn: full for obstacles, for peers only when the own plan is stuck, because turned normals would
-    also keep a swarm that shares one goal from closing in evenly.
+    also keep a swarm that shares one goal from closing in evenly. `to_goal` (slots, Hp, axes) is what is left to fly
+    with regard to the keep-out: one that moves towards an agent at its goal is passed as well, not fled from.
     """
     if not angle_rad.any():
         return normal
-    span = np.sqrt(np.einsum("kc,kc->k", to_goal, to_goal))  # (Hp,)
-    ahead = -np.einsum("skc,kc->sk", normal, to_goal) / np.maximum(span, _TINY_M)  # cosine: 1 is head-on
+    span = np.sqrt(np.einsum("skc,skc->sk", to_goal, to_goal))
+    ahead = -np.einsum("skc,skc->sk", normal, to_goal) / np.maximum(span, _TINY_M)  # cosine: 1 is head-on
     weight = np.clip((ahead - 0.7) / 0.3, 0.0, 1.0) * (span > 0.75 * needed) * (distance < 2.0 * needed + 0.5)
     angle = angle_rad * weight
     c, s = np.cos(angle), np.sin(angle)
