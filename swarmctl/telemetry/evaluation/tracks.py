@@ -163,12 +163,20 @@ def _reported_positions(rows: NDArray[np.void], time_field: str, at_us: NDArray[
 
 
 def unseen_spans(rows: NDArray[np.void], time_field: str) -> list[tuple[float, float]]:
-    """Return the intervals in which an armed vehicle's position was stale or unknown, from known to known position."""
-    unseen = (rows["armed"] != 0) & ~(_located(rows) & (rows["state_age_ms"] <= _STALE_MS))
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], unseen, [False]])))
-    t_us = rows[time_field].astype(np.float64)
-    last = len(rows) - 1
-    return [(float(t_us[max(0, first - 1)]), float(t_us[min(last, end)])) for first, end in edges.reshape(-1, 2)]
+    """Return the intervals in which an armed vehicle's position was stale or unknown, from known to known position.
+
+    Also unknown is what was between two ticks, or two states, that are too far apart to interpolate.
+    """
+    if not len(rows):
+        return []
+    t_us, armed, located = rows[time_field].astype(np.float64), rows["armed"] != 0, _located(rows)
+    age_us = np.where(located, rows["state_age_ms"] * 1e3, np.nan)
+    unseen = armed & ~(located & (rows["state_age_ms"] <= _STALE_MS))
+    ticks_missing = (np.diff(t_us) > _GAP_US) & (armed[:-1] | armed[1:])
+    states_missing = (np.diff(t_us - age_us) > _GAP_US) & armed[:-1] & armed[1:]
+    hidden = unseen[:-1] | unseen[1:] | ticks_missing | states_missing  # (T - 1,) of the times between rows
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]])))
+    return [(float(t_us[first]), float(t_us[end])) for first, end in edges.reshape(-1, 2)]
 
 
 def interpolate(at_us: NDArray[np.int64], t_us: NDArray[np.int64], values: Array, gap_us: int) -> Array:

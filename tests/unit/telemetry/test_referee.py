@@ -15,7 +15,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunData, evaluate
-from swarmctl.telemetry.evaluation.tracks import track_error
+from swarmctl.telemetry.evaluation.tracks import merge_tracks, track_error, unseen_spans
 from swarmctl.telemetry.json_safe import to_json
 
 UTC0_US = 1_780_000_000_000_000
@@ -332,6 +332,30 @@ def test_a_vehicle_counts_as_unseen_from_its_last_known_position_to_the_next() -
     stalled["pos_ned_m"][500] = math.nan
     unseen = evaluate(run({0: stalled}), Rules(agents=1, required_separation_m=0.85), "failed")["violations"]
     assert "agent 0 did not know where its armed vehicle was for 0.4 s, from 10.0 s on" in unseen[0]
+
+
+def test_ticks_that_are_missing_in_flight_hide_no_loss_of_separation() -> None:
+    """Agent 1 flies through the place of agent 0 within 0.8 s, in which one of them has recorded nothing."""
+    still, passing = ticks(20, (0.0, 0.0, 0.0)), ticks(20, (0.0, 0.0, 0.0))
+    passing["pos_ned_m"][:, 0] = 4.0 * (passing["mission_t_s"] - 10.0)
+    rules = Rules(agents=2, required_separation_m=0.85)
+    seen = evaluate(run({0: still, 1: passing}), rules, "completed")
+    assert seen["separation"]["min_m"] == pytest.approx(0.0)
+    lost = np.delete(passing, slice(480, 520))
+    (hidden,) = evaluate(run({0: still, 1: lost}), rules, "completed")["violations"]
+    assert hidden.startswith("agent 1 did not know where its armed vehicle was for 0.8 s, from 9.6 s on")
+    lost["armed"] = 0
+    assert evaluate(run({0: still, 1: lost}), rules, "completed")["violations"] == [], "it stands"
+
+
+@pytest.mark.parametrize(("missing", "age_ms", "is_hidden"), [(23, 0.0, False), (24, 0.0, False), (24, 60.0, True)])
+def test_what_can_not_be_interpolated_is_unseen_and_nothing_else(missing: int, age_ms: float, is_hidden: bool) -> None:
+    """A state of the last tick before the gap may be older than those after it."""
+    rows = np.delete(ticks(20, (0.0, 0.0, 0.0)), slice(500, 500 + missing))
+    rows["state_age_ms"][499] = age_ms
+    tracks = merge_tracks({0: rows}, np.zeros(0, TRUTH_DTYPE), 1)
+    assert np.isnan(tracks.pos_ned_m[:, 0]).any() == is_hidden
+    assert bool(unseen_spans(rows, "utc_us")) is is_hidden
 
 
 def test_a_vanished_vehicle_is_named_and_not_judged_by_its_last_position() -> None:
