@@ -156,6 +156,7 @@ def test_two_hosts_fly_one_swarm_that_a_station_commands_and_judges(
         assert separation["min_m"] >= 0.85
         assert separation["min_pair"] == [0, 1]
         assert station.summary()["tracking"]["index_m"] is not None
+        assert [abs(clock["ahead_s"]) < 0.05 for clock in station.summary()["clocks"]] == [True, True], "one computer"
 
 
 def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

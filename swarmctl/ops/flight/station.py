@@ -1,7 +1,7 @@
 """`swarmctl station`: shows, records and judges a swarm that flies from several computers, and lets verbs act on it.
 
 No agent needs it: it may start late, end early, or never be there. What it records are the reports of the agents, so
-it judges by estimates, as a launch over real vehicles does.
+it judges by estimates, as a launch over real vehicles does; it notes when they arrive, as their clocks may differ.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from swarmctl.ops.processes import ROUTER, VIEWER
 from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.ops.supervision.recovery import RECOVERY_S
+from swarmctl.ops.supervision.sender_clocks import SenderClocks
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
 from swarmctl.process_lifetime import StopRequest
@@ -88,7 +89,7 @@ class SwarmWatch:
         agents: size of the swarm.
         directory: run folder for what they report.
         display: shows them.
-        note: is told of refused messages, see `Refusals`, and of lists of obstacles.
+        note: is told of refused messages, see `Refusals`, of lists of obstacles, and of senders' clocks.
         clock_s: monotonic time [s].
 
     Attributes:
@@ -109,7 +110,9 @@ class SwarmWatch:
         self._report, self._note = BusReport(bus, note, display), note
         self._obstacles_version: int | None = None
         self._views = [AgentView(agent=agent) for agent in range(agents)]
-        self._recorders = {agent_name(agent): Recorder(directory, agent) for agent in range(agents)}
+        self._numbers = {agent_name(agent): agent for agent in range(agents)}
+        self._recorders = {name: Recorder(directory, agent) for name, agent in self._numbers.items()}
+        self._clocks = SenderClocks(note)
         self._flying: set[int] = set()  # agents that were heard between the beginning and the end of a flight
         self._stepped_s = clock_s()
         self._is_over = False
@@ -120,10 +123,7 @@ class SwarmWatch:
         """Show and record what has arrived; returns whether every agent was done and has ended, or is lost."""
         now_s = self._clock_s()
         self._excuse_own_pause(now_s)
-        for sender, payload in self._bus.receive(TICK):
-            tick = unpack_tick(payload)
-            if tick is not None:
-                self._recorders[sender].tick(tick[0], None)
+        self._record_ticks()
         for status in self._report.statuses():
             if 0 <= status.agent < len(self._views):
                 view = self._views[status.agent]
@@ -147,8 +147,18 @@ class SwarmWatch:
         """Write what is still to be recorded; who is silent in flight and not waited for any longer counts as lost."""
         if not self._is_over:
             self.problems += self._lost(self._clock_s(), _SILENT_S).values()
+        self._clocks.close()
         for recorder in self._recorders.values():
             recorder.close()
+
+    def _record_ticks(self) -> None:
+        arrived = self._bus.receive(TICK)
+        arrival_us = round(1e6 * self._clock_s())  # not earlier than that of any of them
+        for sender, payload in arrived:
+            tick = unpack_tick(payload)
+            if tick is not None:
+                self._recorders[sender].tick(tick[0], None)
+                self._clocks.received(self._numbers[sender], int(tick[0]["t_us"][0]), arrival_us)
 
     def _has_ended(self, view: AgentView, now_s: float) -> bool:
         done = view.status is not None and view.status.phase == Phase.DONE

@@ -13,6 +13,7 @@ from swarmctl.mavlink.signing.refusals import HARMLESS
 from swarmctl.ops.running_launches import launch_in
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
+from swarmctl.telemetry.evaluation.station_clock import corrected_text
 
 _MISSED_SHOWN = 5  # agents that are named because they have not reached their goals
 
@@ -109,9 +110,8 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
     return (
         outcome,
         _separation(summary)
-        + (
-            f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else ""
-        ),
+        + (f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else "")
+        + _corrected(summary),
         f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')} from arming on, "
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
@@ -133,6 +133,11 @@ def _separation(summary: Mapping[str, Any]) -> str:
     if summary.get("agents") == 1:
         return "no other agent"
     return f"separation {_m(found.get('min_m'))} (required {_m(found.get('required_m'))})"
+
+
+def _corrected(summary: Mapping[str, Any]) -> str:
+    corrected = corrected_text(summary.get("clocks"))
+    return f"; clocks corrected: {corrected}" if corrected else ""
 
 
 def _goals(found: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -29,6 +29,7 @@ from swarmctl.telemetry.evaluation.run_counts import (
     percentiles,
     solver_counts,
 )
+from swarmctl.telemetry.evaluation.station_clock import by_station_clock
 from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
@@ -101,15 +102,17 @@ def evaluate(
         speed_factor: simulated seconds per wall second.
         steady_after_s: mission time from which `steady_rmse_m` and `index_after_10s_m` are computed.
     """
-    tracks = merge_tracks(run.ticks, run.truth, rules.agents)
-    clock = _MissionClock(run.ticks, tracks)
+    clocked = by_station_clock(run.ticks, run.events)
+    run, known = replace(run, ticks=clocked.ticks), clocked.known
+    tracks = merge_tracks(known, run.truth, rules.agents)
+    clock = _MissionClock(known, tracks)
     here = _agents_here(run, rules)
     separation, apart = _evaluate_separation(tracks, rules, here, clock)
     obstacles, clear = _evaluate_obstacles(tracks, rules, clock)
     volume, inside = _evaluate_volume(run, tracks, rules, clock)
     timing, punctual = _evaluate_timing(run.ticks, rules, speed_factor)
     tracking, tracked_s = _evaluate_tracking(run, rules.agents, steady_after_s)
-    unseen = [] if len(run.truth) else list(_unseen(run.ticks, rules.agents, clock))
+    unseen = [] if len(run.truth) else [*clocked.problems(), *_unseen(known, rules.agents, clock)]
     refused = _shorten(list(refused_peers(run.events)))
     configured = dict(enumerate(rules.goals_ned_m))
     goals_ned_m = {agent: configured.get(agent) for agent in here}
@@ -132,6 +135,7 @@ def evaluate(
         "own_controllers": own_controllers(run.events),
         "solver": solver_counts(run.ticks, rules.solver_name, rules.solver_retry),
         "comms": communication(run.ticks, run.events, tracks.time_field),
+        "clocks": clocked.summary(),
         "deadlocks": deadlock_counts(run.events),
         "commitments": commitment_counts(run.events),
     }

@@ -13,7 +13,7 @@ import heapq
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +29,7 @@ from swarmctl.core.types import Array
 from swarmctl.errors import StartError
 from swarmctl.files import replaced
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, RunData
+from swarmctl.telemetry.evaluation.station_clock import by_station_clock
 from swarmctl.telemetry.evaluation.tracks import goal_ned_m, missions
 from swarmctl.telemetry.palette import LIMIT_RGB, NUMBER_RGB, agent_rgb
 from swarmctl.telemetry.recording.run_files import utc_us_of
@@ -74,6 +75,8 @@ def write_mcap(path: Path, recorded: RecordedFlight) -> None:
         raise StartError(
             "MCAP needs a library of its own. Install it, in the checkout: pip install '.[mcap]'"
         ) from error
+    run = recorded.run
+    recorded = replace(recorded, run=replace(run, ticks=by_station_clock(run.ticks, run.events).ticks))
     context = foxglove.Context()
     with replaced(path) as file, foxglove.open_mcap(file, context=context) as writer:
         writer.write_metadata("swarmctl", {"version": __version__})

@@ -88,6 +88,11 @@ class _OwnController(msgspec.Struct):
     mission_ticks: _Count
 
 
+class _Clock(msgspec.Struct):
+    id: Annotated[int, msgspec.Meta(ge=0, lt=1000)]
+    ahead_s: Annotated[float, msgspec.Meta(ge=-1e14, le=1e14)] | None = None  # also of one that begins in 1970
+
+
 class _Summary(msgspec.Struct):
     outcome: Outcome
     violations: list[str]
@@ -104,6 +109,7 @@ class _Summary(msgspec.Struct):
     deadlocks: _Deadlocks = msgspec.field(default_factory=_Deadlocks)
     goals: _Goals | None = None
     own_controllers: list[_OwnController] = []
+    clocks: list[_Clock] | None = None
 
 
 def decode_summary(content: bytes) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,6 +16,7 @@ from swarmctl.core.recorded.tick_record import CURVES, NOT_RECORDED, Curve
 from swarmctl.core.types import Array, ControlMode, Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunData
+from swarmctl.telemetry.evaluation.station_clock import by_station_clock
 from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
@@ -63,13 +65,15 @@ class RunCharts:
     """Draws the charts of one run."""
 
     def __init__(self, run: RunData, summary: Mapping[str, Any], rules: Rules | None) -> None:
-        self._run = run
+        clocked = by_station_clock(run.ticks, run.events)
+        self._run = run = replace(run, ticks=clocked.ticks)
         self._summary = summary
         self._rules = rules
         agents = int(summary["agents"])
-        self._tracks: Tracks = merge_tracks(run.ticks, run.truth, agents)
+        known = clocked.known or run.ticks  # of older recordings no clock is known
+        self._tracks: Tracks = merge_tracks(known, run.truth, agents)
         self._time_field = "t_us" if len(run.truth) else "utc_us"
-        start_us = mission_start_us(run.ticks, self._time_field)
+        start_us = mission_start_us(known, self._time_field)
         first_us = min((int(rows[self._time_field][0]) for rows in run.ticks.values() if len(rows)), default=0)
         self._start_us = first_us if start_us is None else start_us
         ends = [self._seconds(rows[[0, -1]]) for rows in run.ticks.values() if len(rows)]

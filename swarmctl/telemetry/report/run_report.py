@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from swarmctl.files import replace_bytes, replace_text
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR, Rules, RunData
+from swarmctl.telemetry.evaluation.station_clock import corrected_text
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.report.event_table import event_rows
 from swarmctl.telemetry.report.moments import ordinal
@@ -112,6 +113,8 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     yield _least("smallest separation", separation["min_m"], separation["required_m"])
     if obstacles["min_clearance_m"] is not None:
         yield _least("nearest to an obstacle's centre", obstacles["min_clearance_m"], obstacles["required_m"])
+    if corrected := corrected_text(summary.get("clocks")):
+        yield SummaryRow("clocks that were corrected", corrected, note="by when ticks arrived at the station")
     yield from _goal_rows(summary.get("goals"))
     due = timing.get("due_ticks") or timing["ticks"]
     share = timing["late_ticks"] / due if due else None

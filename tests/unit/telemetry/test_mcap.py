@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from swarmctl.api.run import load_run
 from swarmctl.bus.messages.json_messages import first_list
 from swarmctl.config import Config, dump
+from swarmctl.configuration.sections import SwarmParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.recorded.tick_record import COLUMNS
@@ -91,6 +92,21 @@ def test_every_recorded_value_is_there_with_unit_and_words(folder: Path, path: P
     assert described.keys() == names
     assert described["solve_ms"]["description"].endswith("[ms]")
     assert described["phase"]["type"] == "string"
+
+
+def test_ticks_of_a_station_are_at_the_time_by_its_clock(tmp_path: Path) -> None:
+    write_run(tmp_path, 1, 1.0)
+    (tmp_path / "truth.bin").unlink()
+    config = Config(swarm=SwarmParams(agents=1))
+    (tmp_path / "config.toml").write_text(dump(config))
+    noted = (
+        {"event": "started", "agents": [], "t_us": 5_000, "utc_us": UTC_US},
+        {"event": "sender_clock", "agent": 0, "behind_us": 300_000, "t_us": 5_000, "utc_us": UTC_US},
+    )
+    (tmp_path / "launch.events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in noted))
+    finish_run(tmp_path, config.rules(), Outcome(outcome="failed"))
+    first_us = int(load_run(tmp_path).tick_rows(0)["t_us"][0])
+    assert messages(export_mcap(tmp_path, None), "/agent/0/tick")[0][0] == (first_us + 300_000 + UTC_US - 5_000) * 1000
 
 
 def test_up_is_up_and_a_vehicle_is_where_it_was(folder: Path, path: Path) -> None:
