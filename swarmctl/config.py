@@ -342,6 +342,7 @@ def _infeasible(config: Config) -> Iterator[str]:
         downwash=separation.downwash,
         ground_z_m=config.sitl.ground_z_m if config.sitl.enabled else None,
         volume=config.volume.flight_volume(),
+        fence=config.geofence.area(),
     )
     try:
         references = config.mission.references(np.array(config.starts_ned_m()), separation.budget.planned_m)

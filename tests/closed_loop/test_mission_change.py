@@ -120,6 +120,21 @@ def test_what_has_not_arrived_begins_another_day_or_can_not_be_flown_is_refused(
     assert phase(flight, 1) is Phase.TRACK
 
 
+def test_a_mission_that_leaves_the_geofence_is_refused_by_the_operators_side_and_by_each_agent(swap: Path) -> None:
+    fence = "geofence.corners_ne_m=[[-1, -0.5], [5, -0.5], [5, 0.5], [-1, 0.5]]"
+    flight, free = (Lockstep(load(None, (*HOVER, "mission.duration_s=60", *fences))) for fences in ((fence,), ()))
+    fly_until(flight, lambda: phase(flight, 0) is phase(flight, 1) is Phase.TRACK)
+    with pytest.raises(ConfigError, match=r"m outside of geofence\.corners_ne_m"):
+        order(flight, swap)
+    message = mission_message(load_mission(free.config, swap))
+    flight._operator.publish(topics.MISSION, encode_message(message))
+    flight.command(MISSION, agent=-1, **{MISSION: float(message.mission), BEGIN: flight.clock.utc_us() * 1e-6})
+    fly_for(flight, 0.1)
+    for agent in (0, 1):
+        (refused,) = events(flight, agent, "order_refused")
+        assert "outside of geofence.corners_ne_m" in str(refused["reason"])
+
+
 def test_a_file_that_this_swarm_can_not_fly_is_refused_before_it_is_sent(tmp_path: Path) -> None:
     config = load(None, HOVER)
     for text, said in (

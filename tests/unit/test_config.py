@@ -506,6 +506,33 @@ def test_what_does_not_go_with_a_volume_is_refused(overrides: tuple[str, ...], w
     load(None, mission)  # negative control: the volume itself is none
 
 
+FENCE = "geofence.corners_ne_m=[[-3, -3], [3, -3], [3, 3], [-3, 3]]"
+GOAL = ("mission.kind=goto", "swarm.agents=1", "mission.duration_s=60")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (("mission.kind=circle", "mission.circle.radius_m=4.0"), ("m outside of", "north -3 to 3 m, east -3 to 3 m")),
+        ((*GOAL, "mission.goto.goals_ned_m=[[0.0, 5.0, -2.0]]"), ("mission: agent 0: at ", "move the mission or the")),
+        (("start.center_ned_m=[5.0, 0.0, 0.0]", "mission.kind=hover"), ("starts of agents", "lie outside")),
+    ],
+    ids=["way", "goal", "start"],
+)
+def test_what_leaves_the_geofence_is_refused(overrides: tuple[str, ...], words: tuple[str, ...]) -> None:
+    load(None, overrides)  # negative control: without a fence it can be flown
+    text = "; ".join(refusals(None, *overrides, FENCE))
+    assert "geofence.corners_ne_m" in text
+    assert [word for word in words if word not in text] == []
+
+
+@pytest.mark.parametrize(
+    "overrides", [("mission.kind=circle",), (*GOAL, "mission.goto.goals_ned_m=[[0.0, 3.0, -2.0]]")]
+)
+def test_what_stays_within_the_geofence_is_flown_also_on_its_border(overrides: tuple[str, ...]) -> None:
+    load(None, (*overrides, FENCE if overrides[0].endswith("goto") else FENCE.replace("3", "6")))
+
+
 def test_commitments_keep_a_volume_whatever_tracks_them() -> None:
     load(None, ["mission.kind=hover", *BOX, "controller.kind=pid", "separation.mode=guaranteed"])
 

@@ -17,6 +17,7 @@ from swarmctl.control.phases.trajectories import OfferedMission
 from swarmctl.control.reference.feasibility import FlightLimits, infeasible
 from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.operator_verbs import BEGIN, MISSION, Order
+from swarmctl.mavlink.geofence import Geofence
 
 _KEPT = 4  # newest missions
 _SAMPLES = 2000  # of the reference: two milliseconds of a tick
@@ -78,6 +79,7 @@ class MissionChange:
             downwash=setup.separation.downwash,
             ground_z_m=None,  # the operator's side knows it
             volume=setup.volume,
+            fence=Geofence(setup.fence_ne_m) if setup.fence_ne_m else None,
         )
         problems = list(infeasible([reference], [setup.vehicle_model], limits, most_samples=_SAMPLES))
         if problems:

@@ -1,5 +1,5 @@
 """Checks before a flight whether references can be flown: finite, within the vehicles' limits, above ground, in the
-flight volume, apart, and long enough to arrive.
+flight volume and the geofence, apart, and long enough to arrive.
 
 Pure. A reference is sampled over the whole mission; what is refused is told with the first second at which it is wrong.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,19 @@ _STEP_S = 0.02  # time between samples
 _MAX_SAMPLES = 200_000  # of all agents together; long missions of many are sampled more coarsely
 _JUMP_M = 0.02  # difference of positions that velocities need not explain
 _GROUND_M = 0.3  # least height of a reference: bodies have legs
-_OUTSIDE_M = 1e-6  # of the flight volume: rounding
+_OUTSIDE_M = 1e-6  # of flight volume and geofence: rounding
 _SHOWN = 3  # problems
+
+
+class Fence(Protocol):
+    """An area that vehicles stay in, of any height."""
+
+    @property
+    def span(self) -> str:
+        """Return in words from where to where it reaches."""
+
+    def beyond_m(self, at_ne_m: Array) -> Array:
+        """Return how far (K,) positions north and east (K, 2) are outside of it, 0 inside."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +49,7 @@ class FlightLimits:
     downwash: float  # ratio of height to width of the ellipsoid that is kept free
     ground_z_m: float | None  # NED z of the ground; None where it is not known
     volume: FlightVolume | None  # that plans keep to
+    fence: Fence | None = None  # that autopilots keep their vehicles in
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,6 +132,11 @@ def _rules(
         kept = f"volume.margin_m = {limits.volume.params.margin_m:g}"
         leaves = f"the reference is {{}} m outside of the flight volume less {kept}"
         rules.append(_Rule(broken=(beyond > _OUTSIDE_M) & finite, said=leaves, values=beyond))
+    if limits.fence is not None:
+        beyond = limits.fence.beyond_m(pos[:, :2])
+        leaves = f"the reference is {{}} m outside of geofence.corners_ne_m ({limits.fence.span})"
+        said = f"{leaves}; move the mission or the corners"
+        rules.append(_Rule(broken=(beyond > _OUTSIDE_M) & finite, said=said, values=beyond))
     if reference.jumps or not finite.all():
         return rules
     speed = np.linalg.norm(vel, axis=1)
