@@ -33,7 +33,7 @@ class VehicleSetup:
         setup: parameters to set, name -> value.
         sysid: system id of the agent, which its heartbeats carry.
         state_rate_hz: rate of the messages that carry the state.
-        note: receives the event `parameters_changed` before any is set.
+        note: receives the event `parameters_changed` before any is set, the take-off height of the climb included.
         originals: values of parameters that an earlier agent has changed, integers where the vehicle stores integers.
 
     Attributes:
@@ -152,16 +152,23 @@ class VehicleSetup:
         self._todo = deque(self._rates(self._dialect) + origin + reads)
 
     def _compare(self) -> None:
-        """Queue a command for each value that differs from the wanted one; without any, the link is set up."""
+        """Queue a command for each value that differs from the wanted one; without any, the link is set up.
+
+        The take-off height is kept to be restored, too, whatever it is: the climb sets it.
+        """
         if self._compared:
             self.ready = True
             return
-        self._compared, told = True, self._autopilot.params
+        assert self._dialect is not None
+        self._compared, told, kept = True, self._autopilot.params, len(self._before)
+        takeoff = self._dialect.takeoff_parameter
+        if takeoff in told:
+            self._before.setdefault(takeoff, self._setting(takeoff, told[takeoff]))
         for name, value in self._setup.items():
             if name in told and not math.isclose(told[name], value, rel_tol=1e-6, abs_tol=1e-9):
                 self._before.setdefault(name, self._setting(name, told[name]))
                 self._todo.append(self._setting(name, value))
-        if self._todo:
+        if len(self._before) > kept:
             self._note("parameters_changed", were=self.left_changed)
 
     def _rates(self, dialect: Dialect) -> list[Command]:

@@ -110,9 +110,12 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start, tmp
     assert {(0, 0), (1, 137), (2, 0)} <= set(ended)
     assert (1, 130) in ended, "its vehicle was landed by another agent"
     assert "the vehicle of agent-1 is on the ground and disarmed" in launched.text()
-    assert launched.events("parameters_changed", "agent-1")[0]["were"]["NAV_DLL_ACT"] == 0
+    were = launched.events("parameters_changed", "agent-1")[0]["were"]
+    assert (were["NAV_DLL_ACT"], were["MIS_TAKEOFF_ALT"]) == (0, 2.5)
     told = values_told(launched.run_dir / "recovery" / "agent-1.tlog", "NAV_DLL_ACT")
     assert (told[0] != 0, told[-1]) == (True, 0), "set for the flight, and by the other agent to what it was before"
+    told = values_told(launched.run_dir / "recovery" / "agent-1.tlog", "MIS_TAKEOFF_ALT")
+    assert (told[0] != 2.5, told[-1]) == (True, 2.5), "set by the climb"
     summary = launched.summary()
     assert summary["outcome"] == "failed"
     assert any("agent-1" in violation for violation in summary["violations"])

@@ -21,6 +21,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 
 PX4_CONFIG, ARDUPILOT_CONFIG = "configs/px4_udp.toml", "configs/ardupilot_udp.toml"
 LONE_PX4 = ("--set", "swarm.agents=1", "--set", 'vehicles=[{sysid=1, url="udpin://127.0.0.1:14540"}]')
+TAKEOFF_HEIGHT = "MIS_TAKEOFF_ALT"  # of a PX4
 END_S = 240.0
 MOST_REPEATED = 2  # flights that do not count
 PLACED_S = 120.0
@@ -79,7 +80,9 @@ def true_rmse_m(launched: Launched, seen: Seen, agent: int = 0) -> float:
 
 def test_a_lone_px4_tracks_its_circle(field: Fielder) -> None:
     here = field(PX4, 1, is_alone=True)
+    takeoff_m = here.witness.read_parameter(0, TAKEOFF_HEIGHT)
     launched = flown(here, PX4_CONFIG, *LONE_PX4)
+    assert here.witness.read_parameter(0, TAKEOFF_HEIGHT) == takeoff_m, "its climb had another height"
     assert launched.summary()["tracking"]["agents"][0]["steady_rmse_m"] < 0.08
     assert true_rmse_m(launched, here.witness.vehicles[0]) < 0.8  # its estimate is 0.3 to 0.6 m off
 

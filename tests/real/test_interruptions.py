@@ -15,7 +15,16 @@ from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION
 from tests.benches.launches import Launched
 from tests.real.autopilots import ARDUCOPTER, PX4, Kind
 from tests.real.conftest import Field, Fielder
-from tests.real.test_flights import ARDUPILOT_CONFIG, BODIES_M, END_S, GROUND_S, LONE_PX4, PX4_CONFIG, booted
+from tests.real.test_flights import (
+    ARDUPILOT_CONFIG,
+    BODIES_M,
+    END_S,
+    GROUND_S,
+    LONE_PX4,
+    PX4_CONFIG,
+    TAKEOFF_HEIGHT,
+    booted,
+)
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 
@@ -38,14 +47,17 @@ def mode_of(here: Field, index: int) -> int:
 
 def test_a_killed_agent_ends_with_its_vehicle_on_the_ground_and_the_others_finish(field: Fielder) -> None:
     here = field(PX4, 3)
+    takeoff_m = here.witness.read_parameter(1, TAKEOFF_HEIGHT)
     launched = here.launch(PX4_CONFIG, "--duration", "30")
     launched.until_phase("TRACK", 3)
     time.sleep(5.0)
+    assert here.witness.read_parameter(1, TAKEOFF_HEIGHT) != takeoff_m
     os.kill(launched.pid_of("agent", "--id", "1"), signal.SIGKILL)
     here.witness.wait(lambda: not here.witness.vehicles[1].armed, 30.0, "landed by its own failsafe and disarmed")
     assert here.witness.vehicles[1].height_m() < 0.3
     assert launched.end(END_S) == EXIT_MISSION, launched.text()
     here.witness.wait(here.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
+    assert here.witness.read_parameter(1, TAKEOFF_HEIGHT) == takeoff_m, "set back by the agent that landed it"
     assert min(tracked_s(launched, 0), tracked_s(launched, 2)) == pytest.approx(30.0, abs=0.5)
     assert here.witness.min_separation_m() > BODIES_M
 

@@ -38,6 +38,7 @@ ASKED_US = {
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 1_000_000,
 }
 GRID_S = 0.04
+_TRIES, _ANSWER_S = 20, 1.0  # a PX4 that boots answers nothing yet
 _FEED_PRIORITY = 12  # above launched agents, at 10: a late position is a wrong one
 
 
@@ -58,6 +59,7 @@ class Seen:
     pos_ned_m: list[tuple[float, float, float]] = field(default_factory=list)  # about the origin
     beats: list[tuple[float, bool, int]] = field(default_factory=list)  # time, armed, custom_mode
     placed: bool = False  # its filter has a position
+    parameters: dict[str, float] = field(default_factory=dict)  # as told; of whole ones a PX4 tells the bits
 
     @property
     def armed(self) -> bool:
@@ -169,6 +171,19 @@ class Witness:
     def set_parameter(self, index: int, name: str, value: float) -> None:
         self.say(index, mav.MAVLink_param_set_message(index + 1, 1, name.encode(), value, mav.MAV_PARAM_TYPE_REAL32))
 
+    def read_parameter(self, index: int, name: str) -> float:
+        """Ask a vehicle for a parameter until it answers."""
+        told = self.vehicles[index].parameters
+        told.pop(name, None)
+        for _ in range(_TRIES):
+            self.say(index, mav.MAVLink_param_request_read_message(index + 1, 1, name.encode(), -1))
+            until_s = time.monotonic() + _ANSWER_S
+            while time.monotonic() < until_s:
+                if name in told:
+                    return told[name]
+                time.sleep(PAUSE_S)
+        raise AssertionError(f"vehicle {index} does not tell {name}")
+
     # --- what has been seen ---
 
     def judge_from_now(self) -> None:
@@ -240,6 +255,10 @@ class Witness:
                 seen.beats.append((t_s, bool(message.base_mode & ARMED_FLAG), message.custom_mode))
         elif number == mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
             seen.placed = True
+        elif number == mav.MAVLINK_MSG_ID_PARAM_VALUE:
+            message = self._codec.decode(frame)
+            if message is not None:
+                seen.parameters[message.param_id] = message.param_value
         elif number in TRUTH_MESSAGES:
             message = self._codec.decode(frame)
             if message is not None:

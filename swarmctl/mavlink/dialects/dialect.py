@@ -84,7 +84,9 @@ class Dialect:
 
     def to_read(self) -> tuple[str, ...]:
         """Return the names of the parameters that an agent reads before flight."""
-        return tuple(dict.fromkeys([*(r.name for r in self.rules), self.hover_parameter, *self.thrust_parameters]))
+        takeoff = [self.takeoff_parameter] if self.takeoff_parameter else []
+        rules = [rule.name for rule in self.rules]
+        return tuple(dict.fromkeys([*rules, self.hover_parameter, *self.thrust_parameters, *takeoff]))
 
     def steps(self, command: Command) -> tuple[Command, ...]:
         """Return the commands that make up one request."""

@@ -26,6 +26,8 @@ LEVEL = [1.0, 0.0, 0.0, 0.0]
 
 
 PX4_WITHOUT_AGENT = {"COM_OBL_RC_ACT": 4, "NAV_DLL_ACT": 3, "COM_DL_LOSS_T": 5}
+PX4_THRUST = {"MPC_THR_HOVER": 0.45, "THR_MDL_FAC": 0.0, "MPC_THR_MIN": 0.1, "MPC_THR_MAX": 1}
+TAKEOFF_M = 2.5  # of a PX4 that has not flown for an agent
 COPTER_WITHOUT_AGENT = {"FS_GCS_ENABLE": 5, "FS_GCS_TIMEOUT": 2.0, "ATC_ANGLE_BOOST": 0, "SYSID_MYGCS": 255}
 
 
@@ -34,7 +36,7 @@ class Vehicle:
 
     def __init__(self, autopilot: int = PX4, **params: float) -> None:
         defaults = {
-            PX4: {**PX4_WITHOUT_AGENT, "MPC_THR_HOVER": 0.45, "THR_MDL_FAC": 0.0, "MPC_THR_MIN": 0.1, "MPC_THR_MAX": 1},
+            PX4: {**PX4_WITHOUT_AGENT, **PX4_THRUST, "MIS_TAKEOFF_ALT": TAKEOFF_M},
             ARDUCOPTER: {"GUID_OPTIONS": 8, "GUID_TIMEOUT": 3.0, "MOT_THST_HOVER": 0.35, **COPTER_WITHOUT_AGENT},
         }
         self.autopilot, self.params = autopilot, {**defaults[autopilot], **params}
@@ -247,7 +249,9 @@ def test_px4_is_left_alone_while_it_may_be_saving_its_parameters_after_a_disarm(
     assert (vehicle.params["NAV_DLL_ACT"], vehicle.vehicle_setup.restored) == (3, False)
     vehicle.run(0.5)
     assert (vehicle.params["NAV_DLL_ACT"], vehicle.vehicle_setup.restored) == (0, True)
-    unchanged = Vehicle().set_up().run(4.0)
+    unchanged = Vehicle()
+    del unchanged.params["MIS_TAKEOFF_ALT"]  # which every climb sets
+    unchanged.set_up().run(6.0)
     unchanged.vehicle_setup.restore(unchanged.clock.now_us())
     assert unchanged.run(0.1).vehicle_setup.restored  # nothing to restore: nothing to wait for
 
@@ -276,6 +280,7 @@ def test_what_an_agent_changes_is_noted_before_and_set_back_by_another(
     ((name, fields, params),) = vehicle.noted
     assert (name, came_with.items() <= params.items()) == ("parameters_changed", True), "before the first was set"
     changed = {name: value for name, value in came_with.items() if vehicle.params[name] != value}
+    changed |= {"MIS_TAKEOFF_ALT": TAKEOFF_M} if autopilot == PX4 else {}
     assert fields["were"] == changed
     assert len(changed) >= 2
     vehicle.originals = json.loads(to_json(fields["were"]))
@@ -323,7 +328,45 @@ def test_only_what_was_set_back_counts_as_restored() -> None:
     for command in (Command(verb=Verb.PARAM_GET, name="NAV_DLL_ACT"), wanted):
         setup._open = command  # asked before, and answered now
         setup.on_result(CommandResult(command, True, "3"))
-        assert setup.left_changed == {"NAV_DLL_ACT": 0}
+        assert setup.left_changed["NAV_DLL_ACT"] == 0
+
+
+def climbed(vehicle: Vehicle) -> Vehicle:
+    """The vehicle after its agent has set it up and asked it to take off to another height than its own."""
+    vehicle.set_up().run(4.0)
+    vehicle.port.request(Command(verb=Verb.TAKEOFF, value=7.0))
+    vehicle.run(1.0)
+    assert vehicle.params["MIS_TAKEOFF_ALT"] == 7.0
+    return vehicle
+
+
+def test_the_height_that_a_climb_sets_is_set_back_after_the_flight() -> None:
+    vehicle = climbed(Vehicle())
+    vehicle.vehicle_setup.restore(vehicle.clock.now_us())
+    vehicle.run(3.0)
+    assert vehicle.params["MIS_TAKEOFF_ALT"] == TAKEOFF_M
+    assert (vehicle.vehicle_setup.restored, vehicle.vehicle_setup.left_changed) == (True, {})
+
+
+def test_the_height_that_a_climb_has_set_is_not_taken_for_the_original_after_a_reboot() -> None:
+    vehicle = climbed(Vehicle())
+    vehicle.boot()  # it keeps its parameters
+    vehicle.rates_hz = {331: 30.0}
+    vehicle.run(5.0)
+    assert (vehicle.pilot.clock.boots, vehicle.pilot.params["MIS_TAKEOFF_ALT"]) == (1, 7.0)
+    vehicle.vehicle_setup.restore(vehicle.clock.now_us())
+    vehicle.run(3.0)
+    assert vehicle.params["MIS_TAKEOFF_ALT"] == TAKEOFF_M
+
+
+def test_the_height_that_a_climb_has_set_is_set_back_by_the_agent_that_lands_it() -> None:
+    vehicle = climbed(Vehicle())  # and its agent is killed
+    ((_, fields, _),) = vehicle.noted
+    vehicle.originals = json.loads(to_json(fields["were"]))
+    again = vehicle.set_up().run(4.0).vehicle_setup
+    again.restore(vehicle.clock.now_us())
+    vehicle.run(3.0)
+    assert (vehicle.params["MIS_TAKEOFF_ALT"], again.left_changed) == (TAKEOFF_M, {})
 
 
 def test_after_a_reboot_everything_is_asked_for_again() -> None:
