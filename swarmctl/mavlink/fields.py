@@ -23,7 +23,7 @@ _USED = {
     dialect.MAVLINK_MSG_ID_ODOMETRY: (
         "time_usec x y z q vx vy vz rollspeed pitchspeed yawspeed frame_id child_frame_id reset_counter"
     ),
-    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: "q1 q2 q3 q4 rollspeed pitchspeed yawspeed",
+    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: "time_boot_ms q1 q2 q3 q4 rollspeed pitchspeed yawspeed",
     dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: "time_boot_ms x y z vx vy vz",
     dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: "time_boot_ms lat lon alt",
     dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: "latitude longitude altitude",

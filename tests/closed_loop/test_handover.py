@@ -23,7 +23,7 @@ from swarmctl.core.types import FlightMode, Phase, VehicleState
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import PipeTransport
-from swarmctl.mavlink.vehicle import mode_watch
+from swarmctl.mavlink.vehicle import mode_watch, state_samples
 from tests.closed_loop.conftest import Fly, closer_than, mission_t_s
 
 SETPOINT = 82  # SET_ATTITUDE_TARGET
@@ -221,6 +221,36 @@ def test_arducopter_is_flown_in_its_own_dialect_until_a_pilot_chooses_another_mo
     while not flight.agent.finished and flight.now_us < 90_000_000:
         flight.run.step()
     assert (flight.agent.finished, flight.agent.outcome) == (True, "completed")
+
+
+def without_attitudes() -> tuple[Watched, int]:
+    """A flight whose vehicle has stopped to send its attitude 1.5 s ago, and when it did."""
+    flight = Watched(*COPTER).until_mission(4.0)
+    stop = mavlink.MAVLink_command_long_message(
+        1, 1, 511, 0, mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, -1.0, *[0.0] * 5
+    )
+    PipeTransport.send(flight.run.links[0][0], Codec(255, 190).encode(stop))
+    stopped_us = flight.now_us
+    flight.setpoints_us.clear()
+    flight.step_for(1.5)
+    return flight, stopped_us
+
+
+def test_no_setpoint_is_made_from_an_old_attitude_of_an_arducopter_and_new_ones_are_asked_for() -> None:
+    flight, stopped_us = without_attitudes()
+    assert 0.2 < (flight.setpoints_us[-1] - stopped_us) * 1e-6 < 0.35, "0.1 s from position to attitude, 0.2 s old"
+    asked_before = len(flight.run.logs[0].events)
+    flight.step_for(4.0)
+    asked = [event["verb"] for event in flight.run.logs[0].events[asked_before:] if event["event"] == "command"]
+    assert "rate ATTITUDE_QUATERNION" in asked
+
+
+def test_negative_control_with_an_attitude_of_any_age_an_arducopter_is_flown_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(state_samples, "_APART_US", 10**12)
+    flight, stopped_us = without_attitudes()
+    assert flight.setpoints_us[-1] - stopped_us > 1_400_000
 
 
 def test_an_arducopter_whose_thrust_would_be_a_climb_rate_is_not_armed() -> None:

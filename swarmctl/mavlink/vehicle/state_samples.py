@@ -18,6 +18,7 @@ from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 
 _LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
 _BODY_FRD = (mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_FRD)  # frames of the velocity in ODOMETRY
+_APART_US = 100_000  # by which the attitude's stamp may differ from the position's: two intervals at the lowest rate
 _ODOMETRY_US = 500_000  # a vehicle that has sent ODOMETRY within this time sends its state in it
 
 
@@ -37,7 +38,7 @@ class StateSamples:
 
     newest: Sample | None
     _placed: Placed | None
-    _attitude: tuple[Quaternion, Vector] | None  # with its rates
+    _attitude: tuple[int, Quaternion, Vector] | None  # with its stamp [us] and its rates
     _reset_counter: int | None
     _was_reset: bool  # the estimator has reported a reset since the newest placed sample
 
@@ -74,15 +75,22 @@ class StateSamples:
     def attitude_quaternion(self, message: Any, arrived_us: int) -> None:
         """Keep an attitude for the local positions that follow."""
         q_nb = message.q1, message.q2, message.q3, message.q4
-        self._attitude = q_nb, (message.rollspeed, message.pitchspeed, message.yawspeed)
+        self._attitude = message.time_boot_ms * 1000, q_nb, (message.rollspeed, message.pitchspeed, message.yawspeed)
 
     def local_position(self, message: Any, arrived_us: int) -> None:
-        """Combine a local position with the newest attitude, for autopilots without ODOMETRY."""
+        """Combine a local position with the newest attitude, for autopilots without ODOMETRY.
+
+        A position whose attitude is of another time is refused, so that the state ages when attitudes stop.
+        """
         if self._attitude is None or (arrived_us - self._odometry_us < _ODOMETRY_US and self._odometry_us):
             return
+        vehicle_us = message.time_boot_ms * 1000
+        attitude_us, q_nb, rate = self._attitude
+        if abs(vehicle_us - attitude_us) > _APART_US:
+            self._refused["attitude of another time"] += 1
+            return
         pos, vel = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
-        q_nb, rate = self._attitude
-        self._take(message.time_boot_ms * 1000, arrived_us, pos, vel, q_nb=q_nb, rate=rate)
+        self._take(vehicle_us, arrived_us, pos, vel, q_nb=q_nb, rate=rate)
 
     def placed(self, armed: bool) -> Placed | None:
         """Return the newest sample in the shared frame; None while its place can't be known."""

@@ -210,6 +210,62 @@ def test_position_without_odometry_uses_the_newest_attitude_and_odometry_wins() 
     assert bench.poll().pos_ned_m[0] == pytest.approx(7.0, abs=0.01)
 
 
+def attitude_at(stamp_us: int, q_nb: tuple[float, ...] = LEVEL) -> Any:
+    return dialect.MAVLink_attitude_quaternion_message(stamp_us // 1000, *q_nb, 0.0, 0.0, 0.0)
+
+
+def position_at(stamp_us: int, north_m: float = 0.0) -> Any:
+    return dialect.MAVLink_local_position_ned_message(stamp_us // 1000, north_m, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_a_state_whose_attitudes_have_stopped_grows_old_though_positions_come_and_is_new_when_they_return() -> None:
+    bench = Bench().ready()
+    ages_s: list[float] = []
+    for k in range(100):  # at 50 Hz
+        bench.clock.advance(20_000)
+        now_us = bench.clock.now_us()
+        if not 30 <= k < 80:
+            bench.say(attitude_at(now_us))
+        bench.say(position_at(now_us))
+        bench.heartbeat(custom_mode=4, autopilot=3)
+        state = bench.poll()
+        ages_s.append((now_us - state.t_us) * 1e-6)
+    assert max(ages_s[:30]) < 0.001
+    assert ages_s[79] == pytest.approx(1.0 - 0.1, abs=0.021), "from when the attitude was a tenth of a second old"
+    assert max(ages_s[80:]) < 0.001
+    assert bench.own_codec.refused["attitude of another time"] == 45
+
+
+@pytest.mark.parametrize(("apart_ms", "is_taken"), [(0, True), (-60, True), (100, True), (101, False), (-101, False)])
+def test_a_position_is_taken_with_an_attitude_of_its_time(apart_ms: int, is_taken: bool) -> None:
+    bench = Bench().ready()
+    bench.say(attitude_at(1_000_000))
+    bench.say(position_at(1_000_000 + 1000 * apart_ms))
+    assert (bench.poll() is not None) == is_taken
+
+
+def test_the_first_position_after_a_reboot_is_not_combined_with_an_attitude_of_before() -> None:
+    bench = Bench().ready()
+    bench.say(attitude_at(60_000_000, (0.6, 0.0, 0.8, 0.0)))
+    bench.say(position_at(60_000_000))
+    assert bench.poll() is not None
+    taken = bench.pilot.states.count
+    for k in range(200):  # for longer than a run of other stamps may last, no attitude is sent
+        bench.clock.advance(20_000)
+        bench.say(position_at(1_000_000 + 20_000 * k))
+        bench.poll()
+    assert bench.pilot.states.count == taken
+    for k in range(200, 400):
+        bench.clock.advance(20_000)
+        bench.say(attitude_at(1_000_000 + 20_000 * k))
+        bench.say(position_at(1_000_000 + 20_000 * k))
+        bench.heartbeat(custom_mode=4, autopilot=3)
+        bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
+        state = bench.poll()
+    assert bench.pilot.clock.boots + bench.pilot.clock.restarts > 0
+    np.testing.assert_allclose(state.q_nb, LEVEL, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("autopilot", "custom_mode", "mode"),
     [
