@@ -83,8 +83,8 @@ def find_launch(run: str | None) -> RunningLaunch:
     if len(found) == 1:
         return _flying(found[0])
     if found:
-        names = "\n".join(f"  {launch.run}  {launch.agents} agents  {launch.run_dir}" for launch in found)
-        raise ConfigError("--run", [f"{len(found)} launches run, choose one by its name or folder:\n{names}"])
+        names = ", ".join(f"{launch.run} ({launch.agents} agents, {launch.run_dir})" for launch in found)
+        raise ConfigError("--run", [f"{len(found)} launches run, choose one by its name or folder: {names}"])
     if run is not None:
         known = ", ".join(launch.run for launch in running) or "none"
         raise StartError(f"--run {run}: no launch runs there or has that name; running: {known}")

@@ -491,9 +491,10 @@ def test_with_several_launches_one_is_chosen_by_name_or_folder(
     assert running_launches.find_launch(str(tmp_path / "second")) == swap
     for arguments in (("hold",), ("status",), ("fault", "gust"), ("exclude", "--peer", "1"), ("obstacle", "list")):
         assert run(*arguments) == 2, arguments
-        said = capsys.readouterr().err
+        (said,) = capsys.readouterr().err.splitlines()
         assert "2 launches run" in said
-        assert "circle-1a  3 agents" in said
-        assert "swap-2b  6 agents" in said
+        assert f" circle-1a (3 agents, {tmp_path / 'first'})" in said
+        assert f" swap-2b (6 agents, {tmp_path / 'second'})" in said
+        assert "\\n" not in said
     with pytest.raises(StartError, match=r"running: .*circle-1a"):
         running_launches.find_launch("line")
