@@ -336,6 +336,7 @@ class Agent:
             peers=self._world_model.peers,
             excused=self._world_model.excused,
             others_ned_m=partial(self._world_model.others_ned_m, utc_us),
+            obstacles=self._world_model.obstacles_at_rest,
             arm_in=None if autopilot.dialect is None else autopilot.dialect.arm_in,
             boots=autopilot.clock.boots,
             refusal=self._vehicle_setup.refusal if phase <= Phase.ARM else "",

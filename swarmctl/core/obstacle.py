@@ -41,6 +41,11 @@ class Obstacle(Params):
         """Return the distance [m] of a position (3,) from the centre, or from the axis of a column."""
         return math.dist(self.center_ned_m[: self.axes], pos_ned_m[: self.axes])
 
+    def descent_distance_m(self, pos_ned_m: Array | Sequence[float]) -> float:
+        """Return the distance [m] of the vertical down from a position (3,) from the centre, or from the axis."""
+        north_m, east_m, down_m = pos_ned_m
+        return self.distance_m((north_m, east_m, max(down_m, self.center_ned_m[2])))
+
     def moved(self, elapsed_s: float) -> Obstacle:
         """Return the obstacle as it is after a time: at another centre if it moves."""
         if not self.moves:

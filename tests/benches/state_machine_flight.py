@@ -12,6 +12,7 @@ from swarmctl.control.phases.mission_state import MissionSetup
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.reference.mission import MissionParams, MissionReference
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 from tests import builders
@@ -47,6 +48,7 @@ class Flight:
         self.prepared = self.armable = True
         self.failsafe = False
         self.others: tuple[np.ndarray, ...] = ()
+        self.obstacles: tuple[Obstacle, ...] = ()
         self.arm_in: FlightMode | None = None
         self.boots = 0
         self.refusal = self.unsettled = self.cut_off = ""
@@ -101,6 +103,7 @@ class Flight:
             peers=lambda: self.peers,
             excused=self.excused,
             others_ned_m=lambda: self.others,
+            obstacles=lambda _: self.obstacles,
             arm_in=self.arm_in,
             boots=self.boots,
             refusal=self.refusal,

@@ -12,7 +12,7 @@ PARTS: tuple[tuple[str, tuple[Row, ...]], ...] = (
     ("Peers and the bus", rows_bus.ROWS),
     ("Agents, hosts, clocks, processors", rows_agents.ROWS),
     ("Vehicles, autopilots, pilots", rows_vehicle.ROWS),
-    ("A vehicle that comes down above another", rows_descents.ROWS),
+    ("A vehicle that comes down above another or an obstacle", rows_descents.ROWS),
     ("Tests that are rows", rows_elsewhere.ROWS),
     ("Processes, disk, descriptors, terminal, start", rows_processes.ROWS),
 )

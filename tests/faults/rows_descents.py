@@ -1,14 +1,16 @@
-"""A vehicle that is no longer flown by its agent comes down above another one, which must make room."""
+"""A vehicle comes down by its autopilot, above another one, which must make room, or above an obstacle."""
 
 from __future__ import annotations
 
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.sharing.path_publisher import PathPublisher
+from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.types import Landed
 from tests.closed_loop.conftest import COARSE
 from tests.faults.row import Off
 from tests.faults.rows_agents import lands
 from tests.faults.rows_vehicle import SET_MODE, link, overridden, pilot
-from tests.faults.simulated import AIR, VICTIM, Scene, SimulatedRow, tracking
+from tests.faults.simulated import AIR, VICTIM, Happens, Scene, SimulatedRow, tracking
 
 ABOVE = (  # the victim hovers four metres above agent `BELOW`
     *COARSE,
@@ -23,7 +25,17 @@ ABOVE_GUARANTEED = (*ABOVE, "separation.mode=guaranteed")
 _LONG_ENOUGH_S = 10.0  # to come past the other one
 _PX4_CUSTOM_MODE, _AUTO, _AUTO_LAND = 1.0, 4.0, 6.0
 BY_PHASE_ALONE = Off(patches=((WorldModel, "_flies_in", lambda *_: False),))
+IGNORES_OBSTACLES = Off(patches=((WorldModel, "obstacles_at_rest", lambda *_: []),))
 SHARES_STALE_STATES = Off(patches=((PathPublisher, "_is_recent", lambda *_: True),))
+OVER_A_BALL = (  # one hovers from the ground, five metres above the origin
+    *COARSE,
+    "swarm.agents=1",
+    "start.positions_ned_m=[[0,0,-5]]",
+    "mission.kind=hover",
+    "mission.duration_s=4",
+)
+BALL = Obstacle(center_ned_m=(0.2, 0.0, -1.5), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0)  # not seen from there
+_OVER = 0  # who hovers there
 
 
 def crashes_twice(scene: Scene) -> None:
@@ -42,6 +54,44 @@ def crashes_twice(scene: Scene) -> None:
 
 def has_passed(scene: Scene) -> bool:
     return bool(scene.true(VICTIM)["pos_ned_m"][2] > scene.true(BELOW)["pos_ned_m"][2])
+
+
+def adds_ball(scene: Scene) -> None:
+    """Add an obstacle under the vehicle, as an operator does."""
+    scene.lockstep.set_obstacles([BALL])
+
+
+def lands_over_ball(scene: Scene) -> None:
+    """Order a landing there, too."""
+    adds_ball(scene)
+    scene.lockstep.command("land")
+
+
+def is_down(scene: Scene) -> bool:
+    vehicle = scene.true(_OVER)
+    return bool(vehicle["landed"] == Landed.ON_GROUND and not vehicle["armed"])
+
+
+def is_clear_of_ball(scene: Scene) -> bool:
+    return BALL.distance_m(scene.true(_OVER)["pos_ned_m"]) >= BALL.keep_out_m - scene.config.limits.obstacle_margin_m
+
+
+def _over_ball(name: str, event: str, happens: Happens, told: tuple[str, ...] = ()) -> SimulatedRow:
+    return SimulatedRow(
+        name=name,
+        scene=OVER_A_BALL,
+        event=event,
+        reaction="it lands beside the obstacle, outside of its keep-out",
+        within_s=25.0,
+        protection="a landing place has room from obstacles at rest, down to the ground",
+        due=tracking(1.0),
+        happens=happens,
+        reacts=is_down,
+        lasts_s=25.5,
+        always={"it is in the obstacle's keep-out": is_clear_of_ball},
+        told=told,
+        off=IGNORES_OBSTACLES,
+    )
 
 
 def _row(name: str, scene: tuple[str, ...]) -> SimulatedRow:
@@ -93,5 +143,14 @@ ROWS = (
         told=("agent 1 died",),
         finally_={"the vehicle is still above": has_passed},
         off=BY_PHASE_ALONE,
+    ),
+    _over_ball(
+        "above-obstacle-home", "an operator adds an obstacle below a start, to which a vehicle returns", adds_ball
+    ),
+    _over_ball(
+        "above-obstacle-land",
+        "an operator adds an obstacle below a vehicle, and lands it",
+        lands_over_ball,
+        told=("stopped by the operator",),
     ),
 )

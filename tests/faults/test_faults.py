@@ -23,6 +23,7 @@ SAMPLE = (
     "clock-ahead-guaranteed",
     "link-lost-3s",
     "pilot-kills",
+    "above-obstacle-home",
 )
 
 
@@ -31,7 +32,7 @@ def test_a_row_holds(name: str, tmp_path: Path) -> None:
     ROWS[name].play(tmp_path / "run")
 
 
-@pytest.mark.parametrize("name", ["bus-silent-10s", "link-lost-3s", "solver-not-finite"])
+@pytest.mark.parametrize("name", ["bus-silent-10s", "link-lost-3s", "solver-not-finite", "above-obstacle-home"])
 def test_a_row_fails_without_its_protection(name: str, tmp_path: Path) -> None:
     with pytest.raises(UnmetError):
         ROWS[name].play(tmp_path / "run", protected=False)

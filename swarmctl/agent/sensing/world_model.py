@@ -234,6 +234,18 @@ class WorldModel:
         """Return obstacles at rest that have been visible so far."""
         return [o for o in self._seen.values() if not o.moves]
 
+    def obstacles_at_rest(self, pos_ned_m: Array) -> list[Obstacle]:
+        """Return obstacles at rest that have been visible so far, or will be on the way straight down from (3,).
+
+        The autopilot that lands a vehicle avoids none: what came into sight below it would be seen too late.
+        """
+        return [
+            item.obstacle
+            for item in self._obstacles
+            if not item.obstacle.moves
+            and (item.number in self._seen or item.obstacle.descent_distance_m(pos_ned_m) < item.obstacle.visibility_m)
+        ]
+
     def bodies(
         self,
         pos_ned_m: Array,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from swarmctl.control.failsafe.decision import NOTHING_WORN, Escalation
 from swarmctl.control.failsafe.overload import Level
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, FlightMode, Mode, Phase, VehicleState
 
 
@@ -35,6 +36,7 @@ class PhaseInputs:
     excused: frozenset[int] = frozenset()  # peers that have never been heard, and whom an operator has excluded
     cut_off: str = ""  # why the mission must end here, because peers don't answer
     others_ned_m: Callable[[], Sequence[Array]] = tuple  # returns the present position (3,) of each peer
+    obstacles: Callable[[Array], Sequence[Obstacle]] = lambda _: ()  # returns those at rest known at a position (3,)
     arm_in: FlightMode | None = None  # flight mode required for arming; None: any
     boots: int = 0  # reboots of the autopilot so far
     refusal: str = ""  # reason why arming is refused for good, up to ARM

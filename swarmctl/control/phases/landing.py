@@ -1,17 +1,19 @@
 """Where an agent lands, and whether its autopilot may land it there yet. Pure.
 
-Autopilots do not know each other. Before one takes over, the agent therefore comes to rest and moves away from others
-under its own plan.
+Autopilots know neither each other nor obstacles. Before one takes over, the agent therefore comes to rest and moves
+away from others, and from above obstacles at rest, under its own plan.
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.phases.trajectories import Trajectories, is_at
-from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
+from swarmctl.control.reference.landing_places import Taken, landing_place_ned_m, nearest_in_plane_m
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.types import Array, VehicleState
 
@@ -20,7 +22,7 @@ _ROOM_MARGIN_M = 0.1  # the target lies beyond the required distance, because it
 
 
 class Landing:
-    """Leads the agent to the start position, or to a free place near where it came to rest.
+    """Leads the agent to the start position, or to a free place near it or near where it came to rest.
 
     Args:
         params: tolerances.
@@ -47,10 +49,11 @@ class Landing:
         self._params, self._agent, self._apart_m = params, agent, apart_m
         self._start_ned_m, self._trajectories, self._volume = start_ned_m, trajectories, volume
         self.in_place = False
+        self._beside = False  # its landing place is beside the start position, which an obstacle takes
 
     def go_home(self, now_us: int, state: VehicleState) -> None:
         """Begin the way to the start position."""
-        self.in_place = False
+        self.in_place = self._beside = False
         self._trajectories.go_to(self._start_ned_m, now_us, state)
         self._trajectories.keep_destination()
 
@@ -63,21 +66,19 @@ class Landing:
     def is_reached(self, inputs: PhaseInputs, state: VehicleState, *, controls: bool, paused: bool) -> bool:
         """Return whether the vehicle is at its landing place, or at rest with enough room.
 
-        A vehicle that lands in place and lacks room is sent to a free place first.
+        A vehicle that lands in place and lacks room is sent to a free place first, one whose landing place is over an
+        obstacle to another one beside it.
         """
         begun = self._trajectories.current
         if begun is None:
             return True
         if not self.in_place:
-            target_ned_m = begun.trajectory.to_ned_m
-            return is_at(state, target_ned_m, self._params.land_m, self._params.land_m_s) and not paused
+            return not paused and self._is_home(inputs, state, begun.trajectory.to_ned_m, controls=controls)
         if inputs.now_us - begun.began_us <= (begun.trajectory.travel_s + _SETTLE_S) * 1e6:
             return False
         if self._has_room(inputs, state, controls=controls):
             return self._is_at_rest(state)
-        others_ned_m, apart_m = inputs.others_ned_m(), self._apart_m + _ROOM_MARGIN_M
-        room_ned_m = landing_place_ned_m(state.pos_ned_m, others_ned_m, apart_m, self._agent, self._volume)
-        self._trajectories.go_to(room_ned_m, inputs.now_us, state)
+        self._go_near(state.pos_ned_m, inputs, state)
         return False
 
     def is_possible_here(self, inputs: PhaseInputs, state: VehicleState, *, controls: bool) -> bool:
@@ -87,6 +88,33 @@ class Landing:
     def _is_at_rest(self, state: VehicleState) -> bool:
         return is_at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
 
+    def _is_home(self, inputs: PhaseInputs, state: VehicleState, target_ned_m: Array, *, controls: bool) -> bool:
+        """Return whether the vehicle is at its landing place (3,), or send it to one that is not over an obstacle."""
+        if controls and not self._is_clear(inputs, state, target_ned_m):
+            self._beside = True
+            self._go_near(target_ned_m, inputs, state)
+            self._trajectories.keep_destination()
+            return False
+        arrived = is_at(state, target_ned_m, self._params.land_m, self._params.land_m_s)
+        return arrived and (not self._beside or self._has_room(inputs, state, controls=controls))
+
+    def _go_near(self, wanted_ned_m: Array, inputs: PhaseInputs, state: VehicleState) -> None:
+        """Begin the way to the free place nearest to one (3,), as far as it can be told."""
+        taken = [Taken(center_ned_m=other, apart_m=self._apart_m + _ROOM_MARGIN_M) for other in inputs.others_ned_m()]
+        for obstacle in inputs.obstacles(state.pos_ned_m):
+            if obstacle.column or obstacle.center_ned_m[2] + obstacle.keep_out_m > wanted_ned_m[2]:
+                apart_m = obstacle.keep_out_m + _ROOM_MARGIN_M
+                taken.append(Taken(center_ned_m=np.array(obstacle.center_ned_m), apart_m=apart_m))
+        room_ned_m = landing_place_ned_m(wanted_ned_m, taken, self._agent, self._volume)
+        self._trajectories.go_to(room_ned_m, inputs.now_us, state)
+
     def _has_room(self, inputs: PhaseInputs, state: VehicleState, *, controls: bool) -> bool:
-        """Return whether peers are far enough for a landing; always true without control, which could not change it."""
-        return not controls or nearest_in_plane_m(state.pos_ned_m, inputs.others_ned_m()) >= self._apart_m
+        """Return whether peers and obstacles leave room for a landing; true without control, which can't change it."""
+        if not controls:
+            return True
+        apart = nearest_in_plane_m(state.pos_ned_m, inputs.others_ned_m()) >= self._apart_m
+        return apart and self._is_clear(inputs, state, state.pos_ned_m)
+
+    def _is_clear(self, inputs: PhaseInputs, state: VehicleState, place_ned_m: Array) -> bool:
+        """Return whether no known obstacle's keep-out is on the way down from a place (3,)."""
+        return all(o.descent_distance_m(place_ned_m) >= o.keep_out_m for o in inputs.obstacles(state.pos_ned_m))

@@ -312,6 +312,20 @@ def test_obstacles_that_were_seen_stay_known_when_another_is_added() -> None:
     assert bench.world_model.landmarks() == []
 
 
+def test_a_landing_knows_obstacles_at_rest_that_were_seen_or_will_be_on_the_way_down() -> None:
+    bench = Bench()
+    seen = BALL
+    deep = BALL.model_copy(update={"center_ned_m": (1.0, 0.0, 60.0), "visibility_m": 3.0})
+    beside = deep.model_copy(update={"center_ned_m": (5.0, 0.0, 60.0)})
+    above = deep.model_copy(update={"center_ned_m": (1.0, 0.0, -60.0)})
+    moving = deep.model_copy(update={"vel_ned_m_s": (0.1, 0.0, 0.0)})
+    message = first_list((seen, deep, beside, above, moving), bench.clock.utc_us())
+    bench.operator.publish(topics.OBSTACLES, encode_message(message))
+    bench.tick()
+    assert bench.seen == 1
+    assert bench.world_model.obstacles_at_rest(HERE) == [seen, deep]
+
+
 def test_an_encounter_is_remembered_by_the_obstacles_number_apart_from_peers() -> None:
     bench = Bench()
     bench.say_path()

@@ -7,7 +7,7 @@ import pytest
 
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.control.phases.state_machine import REBOOTED
-from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
+from swarmctl.control.reference.landing_places import Taken, landing_place_ned_m, nearest_in_plane_m
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.state_machine_flight import (
     CONTROLLED_PHASES,
@@ -375,6 +375,10 @@ def test_no_setpoints_are_sent_to_a_vehicle_in_failsafe_or_with_a_pilot(mode: Fl
 CLOSE = START + np.array([0.6, 0.0, 0.0])
 
 
+def taken(*others_ned_m: np.ndarray) -> list[Taken]:
+    return [Taken(center_ned_m=other, apart_m=1.2) for other in others_ned_m]
+
+
 def test_a_landing_in_place_moves_to_a_free_place_first() -> None:
     flight = controlled(Phase.TRACK)
     flight.pos, flight.others = START.copy(), (CLOSE,)
@@ -392,13 +396,13 @@ def test_stacked_vehicles_part_in_different_directions_before_landing() -> None:
     low, high = START.copy(), START - np.array([0.0, 0.0, 3.0])
     assert nearest_in_plane_m(low, [high]) == 0.0
     apart = [
-        landing_place_ned_m(low, [high], 1.2, own) - landing_place_ned_m(high, [low], 1.2, own + 1) for own in range(4)
+        landing_place_ned_m(low, taken(high), own) - landing_place_ned_m(high, taken(low), own + 1) for own in range(4)
     ]
     assert min(np.linalg.norm(gap[:2]) for gap in apart) > 1.2
     crowd = [np.array([0.3 * k, 0.1 * k * k, -2.0]) for k in range(4)]
-    place = landing_place_ned_m(np.array([0.2, 0.2, -2.0]), crowd, 1.2, 5)
+    place = landing_place_ned_m(np.array([0.2, 0.2, -2.0]), taken(*crowd), 5)
     assert nearest_in_plane_m(place, crowd) > 1.1
-    np.testing.assert_array_equal(landing_place_ned_m(low, [], 1.2, 0), low)
+    np.testing.assert_array_equal(landing_place_ned_m(low, [], 0), low)
 
 
 def test_after_the_timeout_it_lands_even_without_room() -> None:

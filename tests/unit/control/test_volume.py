@@ -15,7 +15,7 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc import judgement, swarm_mpc
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import MpcParams
-from swarmctl.control.reference.landing_places import landing_place_ned_m
+from swarmctl.control.reference.landing_places import Taken, landing_place_ned_m
 from swarmctl.control.reference.shortest_path import shortest_path
 from swarmctl.control.rollout import ModelledVehicle
 from swarmctl.core.flight_volume import FlightVolume, VolumeParams
@@ -284,9 +284,10 @@ def test_a_detour_does_not_lead_out_of_the_sides() -> None:
 
 def test_a_landing_place_is_inside() -> None:
     pos, other = np.array([0.0, 3.6, -2.0]), np.array([0.3, 3.2, -2.0])
-    place = landing_place_ned_m(pos, [other], 1.1, 0)
+    taken = [Taken(center_ned_m=other, apart_m=1.1)]
+    place = landing_place_ned_m(pos, taken, 0)
     assert float(VOLUME.beyond_plans_m(place)) > 0.0
-    inside = landing_place_ned_m(pos, [other], 1.1, 0, VOLUME)
+    inside = landing_place_ned_m(pos, taken, 0, VOLUME)
     assert float(VOLUME.beyond_plans_m(inside)) <= 1e-6
     assert np.linalg.norm((inside - other)[:2]) >= 1.1 - 0.01
 
