@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from swarmctl.configuration.source import shown
-from swarmctl.core.params import Params
+from swarmctl.core.params import OTHER_KEY, Params
 from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
 
@@ -71,6 +71,8 @@ def _explain(error: dict[str, Any], root: type[Params], within: str, renamed: Ma
     if error["type"] == "tuple_type":
         sections = isinstance(error["input"], dict) and _keys_at(location, root)
         return f"{key} = {value}: " + (f"one of a list; write [[{key}]]" if sections else "give a list in brackets")
+    if error["type"] == OTHER_KEY:
+        return f"{key} = {value}: {error['msg']}"
     message = error["msg"]
     return f"{key} = {value}: {message[:1].lower()}{message[1:]}{_range_of(location, root)}"
 

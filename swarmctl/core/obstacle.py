@@ -8,9 +8,10 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import ConfigDict, Field, ValidationInfo, field_validator
+from pydantic_core import PydanticCustomError
 
-from swarmctl.core.params import Params
+from swarmctl.core.params import OTHER_KEY, Params
 from swarmctl.core.types import Array
 
 MAX_OBSTACLE_M = 10_000.0  # limit of every coordinate
@@ -21,12 +22,43 @@ _Vector = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=F
 class Obstacle(Params):
     """A sphere, or a vertical column of any height, visible to agents only from closer than `visibility_m`."""
 
+    model_config = ConfigDict(validate_default=True)  # a default may not go with another key
+
     center_ned_m: _Vector  # when the launch starts, or when it is added
     column: bool = False  # true: of any height
     radius_m: float = Field(1.0, gt=0, le=1000)  # the obstacle itself, which the safety filter keeps clear of
-    keep_out_m: float = Field(1.75, gt=0, le=1000)  # constraint radius from the centre, thesis 1 + 2.5 x 0.3
-    visibility_m: float = Field(3.0, gt=0, le=10000)  # agents farther from the centre do not see it
+    keep_out_m: float = Field(1.75, gt=0, le=1000)  # constraint radius, at least radius_m; thesis 1 + 2.5 x 0.3
+    visibility_m: float = Field(3.0, gt=0, le=10000)  # agents farther from the centre do not see it; over keep_out_m
     vel_ned_m_s: _Vector = (0.0, 0.0, 0.0)  # constant
+
+    @field_validator("keep_out_m")
+    @classmethod
+    def _holds_body(cls, keep_out_m: float, known: ValidationInfo) -> float:
+        """Refuse a keep-out inside of the body, into which plans would lead."""
+        radius_m = known.data.get("radius_m", 0.0)
+        if keep_out_m < radius_m:
+            raise PydanticCustomError(
+                OTHER_KEY,
+                "less than radius_m = {radius_m}, so that agents would fly into it; allowed: >= {radius_m}; raise it, "
+                "or lower radius_m",
+                {"radius_m": f"{radius_m:g}"},
+            )
+        return keep_out_m
+
+    @field_validator("visibility_m")
+    @classmethod
+    def _is_seen_before(cls, visibility_m: float, known: ValidationInfo) -> float:
+        """Refuse an obstacle that is seen only from within its keep-out."""
+        key = "keep_out_m" if "keep_out_m" in known.data else "radius_m"
+        kept_m = known.data.get(key, 0.0)
+        if visibility_m <= kept_m:
+            raise PydanticCustomError(
+                OTHER_KEY,
+                "agents would see it only when they are in its {key} = {kept_m}; allowed: > {kept_m}; raise it, or "
+                "lower {key}",
+                {"key": key, "kept_m": f"{kept_m:g}"},
+            )
+        return visibility_m
 
     @property
     def axes(self) -> int:

@@ -10,6 +10,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
+OTHER_KEY = "other_key"  # type of the error of a value that does not go with another key's; its message has the range
+
 
 class Params(BaseModel):
     """Base of a frozen section of the configuration."""

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
+from swarmctl.agent.sensing.world_model import WorldModel
+from swarmctl.bus.messages.json_messages import ListedObstacle
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import Mode, Phase
+from swarmctl.core.types import Array, Mode, Phase
+from swarmctl.errors import ConfigError
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle, evaluate
 from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
 
 CONFIG, PUBLISHED = "improved_6_obstacle.toml", "thesis_6_obstacle.toml"
@@ -69,13 +75,14 @@ def test_the_obstacle_is_known_only_within_the_visibility_distance() -> None:
         assert distance[seen].max() < 3.0
 
 
-def test_negative_control_unseen_it_is_hit(fly: Fly) -> None:
+def test_negative_control_unseen_it_is_hit(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     def is_hit(running: Lockstep) -> bool:
         center = np.array(running.config.obstacles[0].center_ned_m)
         apart_m = np.linalg.norm(running.world.truth_rows()["pos_ned_m"] - center, axis=1)
         return bool(apart_m.min() < running.config.obstacles[0].radius_m)
 
-    blind = fly("obstacles.0.visibility_m=0.1", "sitl.start=air", config=PUBLISHED, until=is_hit)  # after 4.4 s
+    monkeypatch.setattr(WorldModel, "_visible", lambda *_: {})
+    blind = fly("sitl.start=air", config=PUBLISHED, until=is_hit)  # after 4.4 s
     assert clearance_m(blind) < 1.0
 
 
@@ -104,3 +111,46 @@ def test_a_column_that_comes_straight_at_a_hovering_agent_is_passed(speed_m_s: f
     assert least_m >= 0.9
     assert north_m > -1.5, "it is not driven along"
     assert not flight.logs[0].ticks["safety_filter_acted"].any()
+
+
+PAST_A_BALL = (  # nine metres north, a ball half way
+    "swarm.agents=1",
+    "sitl.start=air",
+    "start.positions_ned_m=[[0,0,-3]]",
+    "mission.kind=goto",
+    "mission.goto.goals_ned_m=[[9,0,-3]]",
+    "mission.duration_s=8",
+)
+BALL = Obstacle(center_ned_m=(4.5, 0.4, -3.0), radius_m=1.75, keep_out_m=1.75, visibility_m=3.0)
+
+
+def summary_past(ball: Obstacle, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Fly past a ball of any sizes, also such as no list of obstacles may have, and return the referee's summary."""
+    at = ListedObstacle(number=0, since_utc_us=0, obstacle=ball)
+    with monkeypatch.context() as patch:
+        patch.setattr(WorldModel, "_visible", lambda model, pos, utc_us: _seen(at, pos, utc_us))
+        flight = fly_now(*PAST_A_BALL)
+    rules = replace(flight.config.rules("lockstep"), obstacles=(JudgedObstacle(number=0, obstacle=ball),))
+    return evaluate(flight.lockstep.recorded(), rules, "completed")
+
+
+def _seen(item: ListedObstacle, pos_ned_m: Array, utc_us: int) -> dict[int, Obstacle]:
+    there = item.at(utc_us)
+    return {item.number: there} if there.distance_m(pos_ned_m) < there.visibility_m else {}
+
+
+def test_no_vehicle_enters_a_body_that_is_as_large_as_its_keep_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    summary = summary_past(BALL, monkeypatch)
+    assert summary["outcome"] == "completed"
+    assert summary["obstacles"]["min_clearance_m"] >= BALL.radius_m
+
+
+def test_negative_control_a_body_larger_than_its_keep_out_is_entered_and_the_referee_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(ConfigError, match="less than radius_m = 3"):
+        fly_now(*PAST_A_BALL, "obstacles=[{center_ned_m=[4.5,0.4,-3],radius_m=3}]")
+    summary = summary_past(BALL.model_copy(update={"radius_m": 3.0}), monkeypatch)
+    assert BALL.keep_out_m < summary["obstacles"]["min_clearance_m"] < 2.9, "more than 0.1 m inside of the body"
+    assert summary["outcome"] == "failed"
+    assert any("below 3 m between agent 0 and obstacle 0" in violation for violation in summary["violations"])

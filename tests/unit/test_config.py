@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -337,6 +338,7 @@ def test_dump_keeps_lists_of_tables_and_parameters(tmp_path: Path) -> None:
     text = (
         "[agent.autopilot_params]\nCOM_OBL_RC_ACT = 4\nCOM_OF_LOSS_T = 1.5\n"
         "[[obstacles]]\ncenter_ned_m = [1, 2, -3]\n[[obstacles]]\ncenter_ned_m = [1e-7, 2.5, -3]\nradius_m = 2\n"
+        "keep_out_m = 2.75\nvisibility_m = 5\n"
     )
     config = load(file_with(tmp_path, text))
     assert load(file_with(tmp_path, dump(config))) == config
@@ -470,6 +472,40 @@ def test_obstacles_that_agents_would_refuse_are_refused(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(ConfigError, match=problem):
             load(path)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "problems"),
+    [
+        (
+            "radius_m=3",
+            (
+                "obstacles.0.keep_out_m = 1.75: less than radius_m = 3, so that agents would fly into it; "
+                "allowed: >= 3; raise it, or lower radius_m",
+                "obstacles.0.visibility_m = 3.0: .* only when they are in its radius_m = 3; allowed: > 3",
+            ),
+        ),
+        ("radius_m=2,visibility_m=9", ("obstacles.0.keep_out_m = 1.75: less than radius_m = 2",)),
+        ("radius_m=0.5,keep_out_m=0.4", ("obstacles.0.keep_out_m = 0.4: less than radius_m = 0.5",)),
+        (
+            "keep_out_m=3",
+            ("obstacles.0.visibility_m = 3.0: agents would see it only when they are in its keep_out_m = 3",),
+        ),
+        (
+            "visibility_m=1.5",
+            ("obstacles.0.visibility_m = 1.5: .* keep_out_m = 1.75; allowed: > 1.75; raise it, or lower",),
+        ),
+    ],
+)
+def test_an_obstacle_is_kept_out_of_and_seen_before_that(sizes: str, problems: tuple[str, ...]) -> None:
+    found = refusals(None, f"obstacles=[{{center_ned_m=[40,0,0],{sizes}}}]")
+    assert len(found) == len(problems)
+    for problem, line in zip(problems, found, strict=True):
+        assert re.match(problem, line), line
+
+
+def test_negative_control_a_keep_out_may_be_as_large_as_the_body() -> None:
+    load(None, ["obstacles=[{center_ned_m=[40,0,0],radius_m=2,keep_out_m=2,visibility_m=2.01}]"])
 
 
 @pytest.mark.parametrize(("old", "new"), sorted(_RENAMED.items()))

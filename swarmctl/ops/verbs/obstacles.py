@@ -39,9 +39,11 @@ def obstacle_add(
     center: Annotated[str, typer.Option("--center", metavar="N,E,D", help="Centre, shared NED [m].")],
     radius: Annotated[float, typer.Option("--radius", help="Physical radius [m].")] = 1.0,
     keep_out: Annotated[
-        float | None, typer.Option("--keep-out", help="Keep-out radius [m]; default: radius + 0.75.")
+        float | None, typer.Option("--keep-out", help="Keep-out [m], at least the radius; default: radius + 0.75.")
     ] = None,
-    visibility: Annotated[float, typer.Option("--visibility", help="Range at which agents see it [m].")] = 3.0,
+    visibility: Annotated[
+        float, typer.Option("--visibility", help="Range at which agents see it [m], over the keep-out.")
+    ] = 3.0,
     velocity: Annotated[str, typer.Option("--velocity", metavar="N,E,D", help="Velocity, shared NED [m/s].")] = "0,0,0",
     column: Annotated[
         bool, typer.Option("--column", help="A vertical column of unlimited height, not a sphere.")

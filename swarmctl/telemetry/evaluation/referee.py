@@ -63,7 +63,7 @@ class Rules:
     agents: int
     required_separation_m: float
     obstacles: tuple[JudgedObstacle, ...] = ()
-    obstacle_margin_m: float = 0.05  # allowed intrusion into keep_out_m
+    obstacle_margin_m: float = 0.05  # allowed intrusion into keep_out_m, never into radius_m
     deadline_misses_01: float = 0.2  # largest fraction of due ticks, flown or skipped, that may miss their deadline
     solver_name: str = "osqp"
     solver_retry: str = "osqp"  # solves what that one does not finish
@@ -224,7 +224,7 @@ def _evaluate_obstacles(
     violations = []
     for judged in rules.obstacles:
         obstacle, until_utc_us = judged.obstacle, judged.until_utc_us
-        required_m = obstacle.keep_out_m - rules.obstacle_margin_m
+        required_m = max(obstacle.keep_out_m - rules.obstacle_margin_m, obstacle.radius_m)
         since_us = clock.first_us if judged.since_utc_us is None else judged.since_utc_us - clock.utc_offset_us
         elapsed_s = (tracks.t_us - since_us) / 1e6
         center_ned_m = obstacle.center_after(elapsed_s[:, None])  # (T, 3)

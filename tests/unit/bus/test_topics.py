@@ -349,6 +349,8 @@ def test_lists_and_numbers_from_outside_are_bounded() -> None:
     assert decode_obstacles(encode_message(first_list((ball,) * (MAX_OBSTACLES + 1), UTC_US))) is None
     for fields in ({"center_ned_m": [0, 0, 1e5]}, {"vel_ned_m_s": [-1e5, 0, 0]}, {"keep_out_m": 1e5}):
         assert decode_obstacles(obstacles(**fields)) is None
+    for fields in ({"radius_m": 1.76}, {"keep_out_m": 0.9}, {"keep_out_m": 3.0}, {"visibility_m": 1.75}):
+        assert decode_obstacles(obstacles(**fields)) is None
     for name in ("agent", "boot_id", "ticks", "ready_utc_us", "utc_us"):
         for value in (-1, 10**30):
             assert (

@@ -364,6 +364,20 @@ def test_obstacles_are_read_strictly() -> None:
     ]
 
 
+def test_an_obstacle_that_agents_would_fly_into_is_not_added() -> None:
+    for sizes_m, problems in (
+        ((3.0, 1.75, 3.0), ("--keep-out 1.75: less than radius_m = 3,", "--visibility 3.0: agents would see it only")),
+        (
+            (2.5, 3.25, 3.0),
+            ("--visibility 3.0: agents would see it only when they are in its keep_out_m = 3.25; allowed",),
+        ),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            obstacle_list.obstacle("1.5,0,-2", *sizes_m, velocity="0,0,0")
+        assert len(caught.value.problems) == len(problems)
+        assert all(said.startswith(begin) for said, begin in zip(caught.value.problems, problems, strict=True))
+
+
 def test_the_registry_knows_live_launches_and_forgets_dead_ones(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -209,6 +209,15 @@ def test_height_does_not_count_beside_a_column(column: bool, clearance_m: float)
     assert (summary["outcome"] == "failed") == column
 
 
+@pytest.mark.parametrize(("distance_m", "outcome"), [(0.97, "failed"), (1.01, "completed")])
+def test_the_margin_of_a_keep_out_does_not_reach_into_the_body(distance_m: float, outcome: str) -> None:
+    ball = Obstacle(center_ned_m=(distance_m, 0.0, 0.0), radius_m=1.0, keep_out_m=1.0)
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles=(JudgedObstacle(number=0, obstacle=ball),))
+    summary = evaluate(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
+    assert summary["obstacles"]["required_m"] == 1.0
+    assert summary["outcome"] == outcome
+
+
 def test_moving_obstacle_is_met_where_it_is_at_the_time() -> None:
     ball = Obstacle(center_ned_m=(10.0, 0.0, 0.0), keep_out_m=1.0, vel_ned_m_s=(-1.0, 0.0, 0.0))
     rules = Rules(agents=1, required_separation_m=0.5, obstacles=(JudgedObstacle(number=0, obstacle=ball),))

@@ -160,6 +160,7 @@ def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path: Path) -> None:
     path = tmp_path / "obstacles.toml"
     path.write_text(
         "[swarm]\nagents = 3\n[[obstacles]]\nradius_m = -1.0\n[[obstacles]]\ncenter_ned_m = [0.0, nan, 0.0]\nsize = 2\n"
+        "[[obstacles]]\ncenter_ned_m = [0.0, 0.0, 0.0]\nradius_m = 2\n"
     )
     with pytest.raises(ConfigError) as caught:
         obstacle_list.read_file(path)
@@ -168,6 +169,7 @@ def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path: Path) -> None:
         "obstacles.0.radius_m",
         "obstacles.1.center_ned_m.1",
         "obstacles.1.size",
+        "obstacles.2.keep_out_m",
         "swarm",
     ]
 
