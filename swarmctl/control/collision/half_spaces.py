@@ -12,6 +12,7 @@ from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.types import Array
 
 _TINY_M = 1e-6  # nearer centres have no direction
+_SWING_M = 0.05  # approach that needs no more room: agents of a formation, kept apart for it, would swing the more
 
 
 def half_spaces(
@@ -133,7 +134,7 @@ def _approach_m(keep_outs: KeepOuts, here_ned_m: Array, apart: Array, params: Se
         params: share and limit.
     """
     now_m = np.array([k.apart_m(here_ned_m) for k in keep_outs])[:, None]
-    closing_m = np.maximum(now_m - np.sqrt(np.einsum("skc,skc->sk", apart, apart)), 0.0)
+    closing_m = np.maximum(now_m - np.sqrt(np.einsum("skc,skc->sk", apart, apart)) - _SWING_M, 0.0)
     closing_m[keep_outs.obstacles] = 0.0
     return np.asarray(np.minimum(params.approach_01 * closing_m, params.approach_max_m))
 
