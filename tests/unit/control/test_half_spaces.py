@@ -128,9 +128,10 @@ def test_far_keep_outs_get_no_row() -> None:
 
 @pytest.mark.parametrize("axes", [2, 3])
 def test_plans_keep_more_from_a_peer_that_comes_closer_and_less_the_less_is_left(axes: int) -> None:
-    """From 2.9 m to 1.9 m away: 0.3 of the metre, at most 0.15 m; then nothing where nobody comes closer."""
+    """From 2.9 m to 1.9 m away: 0.3 of what is beyond 5 cm, at most 0.15 m; nothing where nobody comes closer."""
     closing = line((-2.9, 0.0, -2.0), (-1.9, 0.0, -2.0))
     steady = line((-1.9, 0.0, -2.0), (-1.9, 0.0, -2.0))
+    swinging = line((-1.95, 0.0, -2.0), (-1.9, 0.0, -2.0))
     peer_at_origin, obstacle = fixed((0.0, 0.0, -2.0), 0.8), replace(fixed((0.0, 0.0, -2.0), 0.8), priority_id=-1)
     params = PARAMS.model_copy(
         update={"approach_01": 0.3, "approach_max_m": 0.15, "right_of_way_rad": 0.0, "right_of_way_obstacle_rad": 0.0}
@@ -143,10 +144,11 @@ def test_plans_keep_more_from_a_peer_that_comes_closer_and_less_the_less_is_left
         return np.asarray(-spaces.offset_m[0])
 
     radius_m = peer_at_origin.radius_m
-    want_m = radius_m + np.minimum(0.3 * 0.1 * np.arange(1, STEPS + 1), 0.15)
+    want_m = radius_m + np.minimum(0.3 * (0.1 * np.arange(1, STEPS + 1) - 0.05), 0.15)
     np.testing.assert_allclose(np.abs(kept_m(closing, peer_at_origin, params)), want_m, atol=1e-9)
     for guess, keep_out, used in (
         (steady, peer_at_origin, params),
+        (swinging, peer_at_origin, params),
         (closing, obstacle, params),
         (closing, peer_at_origin, params.model_copy(update={"approach_01": 0.0})),
     ):
