@@ -319,7 +319,10 @@ def _start_problems(config: Config) -> Iterator[str]:
         yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
     elif not (listed and listed < agents):
         yield from starts_apart(config.starts_ned_m(), config.separation, config.sitl)
-        yield from obstacle_problems(config.obstacles, config.starts_ned_m(), config.goals_ned_m())
+        from_ground = not config.sitl.enabled or config.sitl.start == "ground"
+        yield from obstacle_problems(
+            config.obstacles, config.starts_ned_m(), config.goals_ned_m(), from_ground=from_ground
+        )
         yield from config.geofence.problems(config.starts_ned_m())
         yield from volume_problems(
             config.volume, config.geofence, config.controller, config.separation, config.starts_ned_m(), config.drift_m

@@ -118,16 +118,26 @@ def obstacle_problems(
     obstacles: Sequence[Obstacle],
     starts_ned_m: Sequence[Sequence[float]],
     goals_ned_m: Sequence[Sequence[float] | None],
+    *,
+    from_ground: bool,
 ) -> Iterator[str]:
-    """Yield which agents would wait in an obstacle, and whose goal is in one that stays where it is."""
+    """Yield which agents would wait in an obstacle or take off through it, and whose goal is in one at rest."""
     for i, obstacle in enumerate(obstacles):
         goals = () if obstacle.moves else goals_ned_m
-        placed = [(f"agent {k} would wait", start) for k, start in enumerate(starts_ned_m)]
-        placed += [(f"the goal of agent {k} is", goal) for k, goal in enumerate(goals) if goal is not None]
-        inside = [(said, at) for said, at in placed if obstacle.distance_m(at) < obstacle.keep_out_m]
+        placed = [(f"agent {k} would wait", obstacle.distance_m(start)) for k, start in enumerate(starts_ned_m)]
+        placed += [
+            (f"the goal of agent {k} is", obstacle.distance_m(goal)) for k, goal in enumerate(goals) if goal is not None
+        ]
+        if from_ground and not obstacle.moves:
+            placed += [
+                (f"agent {k} would take off", obstacle.descent_distance_m(start))
+                for k, start in enumerate(starts_ned_m)
+                if obstacle.distance_m(start) >= obstacle.keep_out_m
+            ]
+        inside = [(said, away_m) for said, away_m in placed if away_m < obstacle.keep_out_m]
         middle = "axis" if obstacle.column else "centre"
-        for said, at in inside[:_PAIRS_SHOWN]:
-            distance = f"{obstacle.distance_m(at):.2f} m from its {middle}"
+        for said, away_m in inside[:_PAIRS_SHOWN]:
+            distance = f"{away_m:.2f} m from its {middle}"
             yield f"obstacles.{i}: {said} {distance}; its keep_out_m is {obstacle.keep_out_m:g}. Move one of them"
         if len(inside) > _PAIRS_SHOWN:
             yield f"obstacles.{i}: {len(inside) - _PAIRS_SHOWN} more starts or goals are within its keep_out_m"

@@ -168,6 +168,7 @@ GOTO = "mission.kind=goto"
     [
         (("start.center_ned_m=[3, 0, 0]",), "obstacles.0: agent 2 would wait 0.00 m from its centre; its keep_out_m"),
         (("start.center_ned_m=[0, 2.1, -9]",), "obstacles.1: agent 1 would wait 0.90 m from its axis"),
+        (("start.center_ned_m=[2.5, 0, -9]",), "obstacles.0: agent 2 would take off 0.50 m from its centre; its keep"),
         (
             (GOTO, "mission.goto.goals_ned_m=[[-9, 0, 0], [4, 1.5, 0], [9, 0, 0]]"),
             "obstacles.0: the goal of agent 1 is 1.50 m from its centre; its keep_out_m is 1.75. Move one of them",
@@ -186,6 +187,7 @@ def test_starts_and_goals_in_obstacles_or_beyond_all_bounds(overrides: tuple[str
     [
         (),
         ("start.center_ned_m=[1.2, 0, 0]",),
+        ("start.center_ned_m=[2.5, 0, -9]", "sitl.start=air"),
         (GOTO, "mission.goto.goals_ned_m=[[-9, 0, 0], [4, 1.8, 0], [9, 0, 0]]"),
         (GOTO, "mission.goto.goals_ned_m=[[4, 0, -2]]"),  # above it
         (GOTO, "mission.goto.goals_ned_m=[[4, 0, 0]]", "obstacles.0.vel_ned_m_s=[0, 1, 0]"),  # not there for long
