@@ -95,6 +95,17 @@ def test_what_a_pilot_lands_while_it_takes_off_stays_down(field: Fielder, kind: 
     assert not vehicle.armed
 
 
+def test_who_only_warns_of_its_battery_flies_on(field: Fielder) -> None:
+    here = booted(field, 1)
+    launched = here.launch(ARDUPILOT_CONFIG)
+    launched.until_phase("TRACK", 1)
+    for name, value in (("BATT_FS_LOW_ACT", 0.0), ("BATT_LOW_TIMER", 1.0), ("BATT_LOW_VOLT", 13.0)):
+        here.witness.set_parameter(0, name, value)
+    assert launched.end(END_S) == 0, launched.text()
+    assert any("low voltage" in row["text"] for row in launched.events("autopilot_text", "agent-0")), "it has warned"
+    here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
+
+
 def test_an_autopilot_that_starts_again_before_arming_is_waited_for(field: Fielder) -> None:
     here = field(PX4, 3)
     here.witness.wait(lambda: all(v.beats for v in here.witness.vehicles), 20.0, "heartbeats")

@@ -203,10 +203,11 @@ class Autopilot:
         dialect = DIALECTS.get(message.autopilot)
         if dialect is None:
             return
-        self.dialect = dialect
+        self.dialect, mode = dialect, dialect.mode(message.custom_mode)
         self.armed, self.armed_told_us = bool(message.base_mode & _ARMED_FLAG), arrived_us
-        self.watch.alarm(message.system_status >= _CRITICAL)
-        self.watch.told(dialect.mode(message.custom_mode), arrived_us)
+        only_warns = message.system_status == _CRITICAL and mode is FlightMode.EXTERNAL  # it still follows setpoints
+        self.watch.alarm(message.system_status >= _CRITICAL and not only_warns)
+        self.watch.told(mode, arrived_us)
 
     def _current_mode(self, message: Any, arrived_us: int) -> None:
         """Take the mode as from a HEARTBEAT; sent on change, so that a pilot's switch is seen within a tick."""

@@ -63,9 +63,17 @@ def test_origin_signs_north_is_x_east_is_y_higher_is_negative_z() -> None:
 )
 def test_armed_and_failsafe_of_a_heartbeat(base: int, status: int, armed: bool, failsafe: bool) -> None:
     bench = Bench()
-    bench.heartbeat(base=base, status=status)
+    bench.heartbeat(custom_mode=PX4_HOLD, base=base, status=status)
     bench.poll()
     assert (bench.pilot.armed, bench.pilot.failsafe) == (armed, failsafe)
+
+
+@pytest.mark.parametrize(("status", "failsafe"), [(4, False), (5, False), (6, True), (8, True)])
+def test_who_follows_setpoints_while_its_status_is_critical_only_warns(status: int, failsafe: bool) -> None:
+    bench = Bench()
+    bench.heartbeat(status=status)  # ArduCopter tells 5 for the rest of a flight in which it has said "battery low"
+    bench.poll()
+    assert bench.pilot.failsafe == failsafe
 
 
 def test_a_component_that_is_no_autopilot_changes_neither_mode_nor_armed() -> None:
@@ -262,7 +270,7 @@ def test_a_mode_that_came_and_went_between_two_polls_is_shown_once(custom_mode: 
 def test_a_failsafe_that_came_and_went_between_two_polls_is_shown_once() -> None:
     bench = Bench().ready()
     flying(bench, 1.0)
-    bench.heartbeat(status=5)
+    bench.heartbeat(status=8)
     bench.heartbeat(status=4)
     assert bench.poll().failsafe
     assert not flying(bench, 0.02, mode_hz=0.0).failsafe

@@ -59,7 +59,7 @@ def test_a_forged_heartbeat_changes_neither_mode_nor_armed_state(signed: bool) -
     autopilot.poll(0)
     assert autopilot.received_us is not None
     before = autopilot.mode
-    far.send(plain(dialect.MAVLink_heartbeat_message(2, PX4, ARMED, 6 << 16, 5, 3)))
+    far.send(plain(dialect.MAVLink_heartbeat_message(2, PX4, ARMED, 6 << 16, 8, 3)))
     autopilot.poll(1000)
     is_believed = not signed
     assert (autopilot.armed, autopilot.failsafe, autopilot.mode != before) == (is_believed,) * 3
