@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
-from swarmctl.core.types import Command, FlightMode, Phase, VehicleState, Verb
+from swarmctl.core.types import Command, FlightMode, Mode, Phase, VehicleState, Verb
 
 OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes that follow from our own requests
 
@@ -12,6 +12,13 @@ OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes 
 def is_under_other_control(state: VehicleState) -> bool:
     """Return whether a pilot, a ground station or a failsafe controls the vehicle."""
     return state.mode not in OWN_MODES or state.failsafe
+
+
+def is_taken_over(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> bool:
+    """Return whether pilot or autopilot have taken over; where positions are stale, mode and arming may be new."""
+    if inputs.mode is Mode.STATE_STALE and mission.had_control and mission.phase < Phase.LAND:
+        return state.mode is not FlightMode.EXTERNAL or not state.armed
+    return inputs.mode is Mode.PILOT_OVERRIDE
 
 
 def request_control(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:

@@ -82,7 +82,7 @@ class MissionStateMachine:
         if mission.phase is Phase.CONNECT and inputs.prepared:  # peers arm as soon as all agents stand by
             mission.enter(Phase.STANDBY, inputs.now_us)
             return mission.refuse(inputs.refusal, inputs) if inputs.refusal else []
-        if inputs.mode is Mode.PILOT_OVERRIDE and not mission.pilot_override:
+        if not mission.pilot_override and handover.is_taken_over(mission, inputs, state):
             handover.leave_control(mission, inputs)
         if mission.pilot_override:
             if mission.is_down(inputs, state):

@@ -39,6 +39,22 @@ def test_after_a_pilot_override_nothing_is_requested(phase: Phase) -> None:
     assert (flight.phase, flight.mission.outcome) == (Phase.DONE, "pilot or autopilot took over")
 
 
+@pytest.mark.parametrize(("flown", "armed"), [(FlightMode.LAND, True), (FlightMode.EXTERNAL, False)])
+@pytest.mark.parametrize("phase", CONTROLLED_PHASES)
+def test_who_is_landed_without_a_position_is_done_and_has_not_completed(
+    phase: Phase, flown: FlightMode, armed: bool
+) -> None:
+    flight = controlled(phase)
+    flight.failsafe_mode = Mode.STATE_STALE
+    flight.run(1.0)
+    assert flight.mission.had_control, "it may come back"
+    flight.flight_mode, flight.armed = flown, armed
+    flight.run(1.0)
+    flight.armed, flight.landed = False, ON_GROUND
+    assert flight.run(120.0) == []
+    assert (flight.phase, flight.mission.outcome) == (Phase.DONE, "pilot or autopilot took over")
+
+
 STOPPED = "overload: setpoints stopped 0.5 s (26 deadline misses, 2078 since the start)"
 
 
