@@ -247,6 +247,7 @@ class Agent:
             self._vehicle_watch.on_result(result, now_us)
         self._vehicle_watch.report_text()
         self._vehicle_watch.report_jump(now_us)
+        self._vehicle_watch.report_loss(now_us)
         if state is not None:
             self._own_state.update(state, autopilot.hover_thrust_01, controls=self._mission.had_control)
         return state

@@ -29,7 +29,7 @@ _USED = {
     dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: "latitude longitude altitude",
     dialect.MAVLINK_MSG_ID_SYS_STATUS: "onboard_control_sensors_health battery_remaining",
     dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: "landed_state",
-    dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS: "pos_horiz_accuracy",
+    dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS: "pos_horiz_accuracy flags",
     dialect.MAVLINK_MSG_ID_GPS_RAW_INT: "fix_type satellites_visible h_acc",
     dialect.MAVLINK_MSG_ID_ATTITUDE_TARGET: "thrust",
     dialect.MAVLINK_MSG_ID_TIMESYNC: "tc1 ts1",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import time
@@ -31,6 +32,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 LOITER, OFFBOARD = 0x03040000, 0x00060000
 PHASES = ("CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND", "LAND")
 CLIMBED_M, START_HEIGHT_M = 0.5, 2.0
+STRAYED_M = 20.0  # from the middle of the circle; followed for 40 s, the lost position led 180 m away
 STOPPED_S = 60.0  # within which nothing is armed any more, or it is named
 
 
@@ -104,6 +106,19 @@ def test_who_only_warns_of_its_battery_flies_on(field: Fielder) -> None:
     assert launched.end(END_S) == 0, launched.text()
     assert any("low voltage" in row["text"] for row in launched.events("autopilot_text", "agent-0")), "it has warned"
     here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
+
+
+def test_who_has_lost_its_position_is_landed_by_its_autopilot(field: Fielder) -> None:
+    here = field(PX4, 1)
+    launched = here.launch(PX4_CONFIG, *LONE_PX4)
+    launched.until_phase("TRACK", 1)
+    time.sleep(5.0)
+    no_satellites = (b"SIM_GPS_USED", 0.0, mav.MAV_PARAM_TYPE_INT32)  # in any type zero is the same bits
+    here.witness.say(0, mav.MAVLink_param_set_message(1, 1, *no_satellites))
+    assert launched.end(END_S) == EXIT_MISSION, launched.text()
+    assert launched.events("position_lost", "agent-0"), "its estimator has said so"
+    here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
+    assert math.dist(here.witness.vehicles[0].pos_ned_m[-1][:2], (0.0, 0.0)) < STRAYED_M
 
 
 def test_an_autopilot_that_starts_again_before_arming_is_waited_for(field: Fielder) -> None:

@@ -92,6 +92,7 @@ class Endpoint:
         self._seen: set[tuple[int, int]] = set()
         self._texts: deque[tuple[int, Severity, str]] = deque()
         self._text_id = self._text_due_us = self._now_us = 0
+        self._placed = False  # it has had a position since its boot
         self._commands = Commands(self._autopilot, self)
         self._parameters = ParameterLink(self._autopilot.parameters, self, self._tell_parameter)
         self._missions = MissionLink(self._autopilot.store, self)
@@ -282,8 +283,9 @@ class Endpoint:
 
     def _send_streams(self, messages: list[int]) -> int:
         """Send the streams that are due; return how many had content."""
-        placed = self._autopilot.has_position and self._autopilot.ready(self._now_us)
-        told = [message for message in messages if self._has_content(message, placed)]
+        pilot = self._autopilot  # one that has lost its position goes on with what it dead-reckons
+        self._placed = pilot.ready(self._now_us) and (self._placed or pilot.has_position)
+        told = [message for message in messages if self._has_content(message, self._placed)]
         if told:
             report = self._report()
             report.counts = self._counts

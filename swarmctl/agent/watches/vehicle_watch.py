@@ -21,6 +21,7 @@ class VehicleWatch:
     def __init__(self, ports: Ports, alerts: Alerts) -> None:
         self._ports, self._alerts = ports, alerts
         self._gaps = self._jumps = 0  # already reported
+        self._is_lost = False  # as reported
         self._no_origin_us: int | None = None  # since when the vehicle does not tell its origin
 
     def on_result(self, result: CommandResult, now_us: int) -> None:
@@ -58,6 +59,15 @@ class VehicleWatch:
         text = f"estimate jumped by {frame.jump_m:.1f} m: peers keep that much more away"
         self._alerts.put("jump", text, now_us)
         self._ports.note("estimate_jumped", metres=frame.jump_m)
+
+    def report_loss(self, now_us: int) -> None:
+        """Report that the vehicle's estimator has lost its position, or has found it again."""
+        is_lost = self._ports.autopilot.states.is_lost
+        if is_lost:
+            self._alerts.put("lost", "the estimator has lost its position: the autopilot lands", now_us)
+        if is_lost != self._is_lost:
+            self._is_lost = is_lost
+            self._ports.note("position_lost", lost=is_lost)
 
     def report_gap(self, now_us: int, cause: str) -> None:
         """Report that setpoints had stopped for too long, if they had; the cause is "" where it is not known."""

@@ -34,6 +34,8 @@ from swarmctl.mavlink.vehicle.vehicle_health import VehicleHealth
 _ARMED_FLAG = 128
 _CRITICAL = 5
 _PREARM = 1 << 28
+_KNOWS_POSITION = 8 | 16  # ESTIMATOR_POS_HORIZ_REL, ESTIMATOR_POS_HORIZ_ABS
+_LOST_REPORTS = 2  # one after the other, a second apart: flags drop out for a moment, too
 _LOCAL_POSITION = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED  # its time stamps are those of the state
 _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
@@ -257,6 +259,7 @@ class Autopilot:
         self.landed, self.armable, self.health = Landed.UNKNOWN, False, VehicleHealth()
         self.params, self.whole_params = {}, set()
         self.hover_thrust_01 = self.pos_accuracy_m = None
+        self._unaided = 0  # reports in a row of an estimator that knows no position
         self.frame.forget()
 
     # -- frame, clock, accuracy, parameters ---------------------------------------------------------------------------
@@ -284,6 +287,8 @@ class Autopilot:
 
     def _estimator(self, message: Any, arrived_us: int) -> None:
         self._accuracy("ESTIMATOR_STATUS", message.pos_horiz_accuracy)
+        self._unaided = 0 if message.flags & _KNOWS_POSITION or not self.armed else self._unaided + 1
+        self.states.is_lost = self._unaided >= _LOST_REPORTS
 
     def _gps(self, message: Any, arrived_us: int) -> None:
         self._accuracy("GPS_RAW_INT", message.h_acc * 1e-3)

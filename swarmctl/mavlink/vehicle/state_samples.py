@@ -34,6 +34,8 @@ class StateSamples:
     Attributes:
         newest: sample, None before the first.
         count: number of states received; two readings give the rate.
+        is_lost: the estimator of an armed vehicle says that it knows no position: what it goes on sending, by its
+            inertial sensors alone, is not taken, so that the state ages.
     """
 
     newest: Sample | None
@@ -53,7 +55,7 @@ class StateSamples:
     def forget(self) -> None:
         """Discard what the vehicle has reported: it has rebooted, or was never received."""
         self.newest = self._placed = self._attitude = self._reset_counter = None
-        self._was_reset = False
+        self._was_reset = self.is_lost = False
         self._odometry_us = 0
 
     def odometry(self, message: Any, arrived_us: int) -> None:
@@ -107,7 +109,8 @@ class StateSamples:
         """Keep a sample if it is valid and the newest; return whether it was kept."""
         w, x, y, z = q_nb
         norm = math.sqrt((w * w + y * y) + (x * x + z * z))  # in the order of a dot product, by which it rounds
-        if problem := state_problem(pos, vel, rate, norm):
+        problem = "position lost by the estimator" if self.is_lost else state_problem(pos, vel, rate, norm)
+        if problem:
             self._refused[problem] += 1
             return False
         t_us = self._clock.to_local(vehicle_us, arrived_us)

@@ -337,6 +337,32 @@ def test_the_accuracy_an_autopilot_claims(autopilot: int, message: Any, sigma_m:
     assert bench.pilot.pos_accuracy_m == (None if sigma_m is None else pytest.approx(sigma_m))
 
 
+@pytest.mark.parametrize(
+    ("base", "flags", "lost"),
+    [
+        (128, (0x65, 0x65), True),
+        (128, (0x65, 0x37F), False),
+        (128, (0x65, 0x37F, 0x65), False),  # it drops out for a moment
+        (128, (0x6D, 0x6D), False),  # a position by optical flow is relative only
+        (0, (0x65, 0x65), False),  # on the ground an estimator may take its time
+    ],
+)
+def test_an_estimate_that_has_lost_its_position_is_not_taken(base: int, flags: tuple[int, ...], lost: bool) -> None:
+    bench = Bench().ready()
+    bench.heartbeat(base=base)
+    bench.say(odometry(stamp_us=1_000_000))
+    for each in flags:
+        bench.say(dialect.MAVLink_estimator_status_message(0, each, 0, 0, 0, 0, 0, 0, 2.9, 0.5))
+    bench.say(odometry(stamp_us=1_020_000, pos=(3.0, 0.0, 0.0)))
+    assert bench.poll().pos_ned_m[0] == pytest.approx(0.0 if lost else 3.0, abs=0.01)
+    assert bench.pilot.states.is_lost == lost
+    bench.say(dialect.MAVLink_estimator_status_message(0, 0x37F, 0, 0, 0, 0, 0, 0, 0.3, 0.5))
+    bench.say(odometry(stamp_us=1_040_000, pos=(4.0, 0.0, 0.0)))
+    bench.poll()
+    assert bench.pilot.states.newest is not None
+    assert bench.pilot.states.newest.vehicle_us == 1_040_000
+
+
 def test_hover_thrust_is_the_parameters_until_the_vehicle_hovers_by_itself() -> None:
     bench = Bench()
     bench.heartbeat(4, autopilot=3)

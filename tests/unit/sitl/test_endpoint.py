@@ -133,6 +133,15 @@ def test_positions_wait_for_the_estimator() -> None:
     assert len(of("GPS_GLOBAL_ORIGIN", late)) == 1
 
 
+def test_a_lost_position_goes_on_and_its_flags_say_so() -> None:
+    client = Client(run_s=0.004)
+    client.run(1.0)
+    client.world.estimator.lose_gps(0)
+    late = client.run(7.0)[-200:]
+    assert of("ODOMETRY", late)
+    assert not of("ESTIMATOR_STATUS", client.run(1.1))[-1].flags & 0x18
+
+
 def test_health_shows_when_arming_would_be_accepted() -> None:
     client = Client(run_s=0.004, ekf_ready_s=0.5)
     (first, *_) = of("SYS_STATUS", client.run(0.4))
