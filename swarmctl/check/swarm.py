@@ -14,13 +14,13 @@ from swarmctl.check.scan.link_facts import Ned, VehicleFacts
 from swarmctl.check.services import service_findings
 from swarmctl.check.vehicle.findings import vehicle_findings
 from swarmctl.config import Config
+from swarmctl.control.phases.departure import LEAST_CLIMB_M
 from swarmctl.core.types import Landed
 from swarmctl.core.verdict import Verdict
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
 _FAR_M = 30.0  # horizontal distance from the start that is worth a note
-_CLIMB_LEAST_M = 0.5
 _SWAPPED_BY_M = 0.5  # least saving that reports two vehicles as swapped
 
 
@@ -80,9 +80,9 @@ def _start(facts: VehicleFacts, config: Config) -> list[Finding]:
             )
         ]
 
-    if facts.landed is Landed.ON_GROUND and climb_m < _CLIMB_LEAST_M:
+    if facts.landed is Landed.ON_GROUND and climb_m < LEAST_CLIMB_M:
         advice = (
-            f"its start is less than {_CLIMB_LEAST_M} m above the ground it stands on: raise the start (NED, down is "
+            f"its start is less than {LEAST_CLIMB_M} m above the ground it stands on: raise the start (NED, down is "
             "positive) or correct swarm.origin_alt_m"
         )
         return line(FIX, advice, 77)

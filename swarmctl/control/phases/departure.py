@@ -10,6 +10,7 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, VehicleState
 
 _MOST_NAMED = 4  # agents in one line
+LEAST_CLIMB_M = 0.5
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
 
 
@@ -55,6 +56,14 @@ class Climb:
     def height_m(self) -> float:
         """Return the height to climb to, above the ground."""
         return self.ground_z_m - self._start_z_m
+
+    @property
+    def too_low(self) -> str:
+        """Return why the start can't be climbed to from where the vehicle stands, or ""."""
+        if self.height_m >= LEAST_CLIMB_M:
+            return ""
+        found = f"its start is {self.height_m:.1f} m above the ground it stands on, less than {LEAST_CLIMB_M} m"
+        return f"{found}: raise the start (NED, down is positive) or correct swarm.origin_alt_m"
 
     def begin(self, state: VehicleState) -> None:
         """Note where the vehicle is before it is armed."""

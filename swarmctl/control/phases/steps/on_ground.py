@@ -25,6 +25,8 @@ def standby(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
     if not mission.waits_for:
         mission.climb.begin(state)
         mission.airborne = state.landed is Landed.IN_AIR
+        if not mission.airborne and (too_low := mission.climb.too_low):
+            return mission.refuse(too_low, inputs)
         mission.enter(Phase.ARM, inputs.now_us)
         return []
     stays = state.mode is FlightMode.EXTERNAL and inputs.arm_in is None and not inputs.armable
