@@ -241,7 +241,7 @@ COLUMNS = (
     Column(title="phase", width=10, cell=lambda v, s: name_of(Phase, s.phase), justify="left"),
     Column(title="control", width=8, cell=lambda v, s: v.control, justify="left"),
     Column(title="flight", width=8, unit="mode", cell=lambda v, s: name_of(FlightMode, s.flight_mode), justify="left"),
-    Column(title="arm", width=3, cell=lambda v, s: "yes" if s.armed else "no", justify="left"),
+    Column(title="arm", width=3, cell=lambda v, s: _armed(s), justify="left"),
     Column(title="alt", width=5, unit="m", cell=lambda v, s: _altitude(s)),
     Column(title="m/s", width=4, cell=lambda v, s: _number(s.ground_speed_m_s, 1, 4)),
     Column(title="bat", width=3, unit="%", cell=lambda v, s: _number(100.0 * s.battery_01, 0, 3)),
@@ -263,6 +263,11 @@ COLUMNS = (
     Column(title="ends", width=5, unit="s", cell=lambda v, s: _number(s.ends_in_s, 0, 5), only_wide=True),
     Column(title="gps", width=7, unit="sat", cell=lambda v, s: _gps(s), justify="left", only_wide=True),
 )
+
+
+def _armed(status: StatusMessage) -> str:
+    """Return whether it is armed; a vehicle that was not heard has not told."""
+    return "-" if status.flight_mode == FlightMode.UNKNOWN else "yes" if status.armed else "no"
 
 
 def _altitude(status: StatusMessage) -> str:

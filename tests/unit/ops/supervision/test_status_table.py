@@ -102,8 +102,9 @@ def test_three_agents_in_ordinary_flight_look_so() -> None:
 
 def test_what_is_unknown_is_a_dash_and_an_agent_without_a_status_has_its_number() -> None:
     nothing = dict.fromkeys(("ground_speed_m_s", "battery_01", "pos_accuracy_m", "link_age_ms", "separation_m"), -1.0)
-    cells = status_cells(AgentView(agent=7, status=status(7, **nothing, gps_fix=-1)))
-    assert [cells[5], cells[6], cells[7], cells[8], cells[9], cells[10], cells[18]] == ["-"] * 7
+    unheard = status(7, **nothing, gps_fix=-1, flight_mode=FlightMode.UNKNOWN, armed=False)
+    cells = status_cells(AgentView(agent=7, status=unheard))
+    assert [cells[k] for k in (4, 5, 6, 7, 8, 9, 10, 18)] == ["-"] * 8
     assert status_cells(AgentView(agent=11))[0] == "11"
 
 
