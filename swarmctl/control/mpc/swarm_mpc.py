@@ -30,8 +30,6 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Plan, PlanStatus
 
-_SLACK_M = 0.02  # slack from which on a plan is made again
-
 
 class AxisWeights(Params):
     """Sets the quadratic weights of one axis."""
@@ -298,9 +296,9 @@ def planned(
     separation: SeparationParams,
     stopwatch_ns: Callable[[], int],
 ) -> Plan:
-    """Plan within the half-spaces near the guess and, until a plan keeps the distances asked, within others.
+    """Plan within the half-spaces near the guess and, until a plan is not refused, within others.
 
-    Returns the plan that lacks least of those distances; one that is not flown only where all are such.
+    Returns the first plan that may be flown, else the last one solved.
 
     Args:
         spaces_of: returns half-spaces for given parameters.
@@ -311,39 +309,28 @@ def planned(
     began_ns = stopwatch_ns()
     spaces = spaces_of(separation)
     best = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
-    for relaxed, lacks_distance in _relaxed(separation):
-        if spaces is None or not lacks_distance(best):
+    for relaxed in _relaxed(separation):
+        if spaces is None or best.status is not PlanStatus.NOT_CERTIFIED:
             return best
         began_ns, before, spaces = stopwatch_ns(), spaces, spaces_of(relaxed)
         if spaces is not None and not _are_equal(spaces, before):
-            best = _better(best, plan(spaces, (stopwatch_ns() - began_ns) * 1e-3))
+            found = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
+            best = found if found.status in (PlanStatus.OK, PlanStatus.NOT_CERTIFIED) else best
     return best
 
 
-def _better(best: Plan, found: Plan) -> Plan:
-    """Return the plan with less slack of two that may be flown, else the one that may, else the last one solved."""
-    if best.status is PlanStatus.OK:
-        return found if found.status is PlanStatus.OK and found.slack_m < best.slack_m else best
-    return found if found.status is PlanStatus.OK or _is_refused(found) else best
-
-
-def _relaxed(separation: SeparationParams) -> Iterator[tuple[SeparationParams, Callable[[Plan], bool]]]:
-    """Yield parameters of half-spaces for a plan that lacks distance in those before, and whether one does.
+def _relaxed(separation: SeparationParams) -> Iterator[SeparationParams]:
+    """Yield parameters of half-spaces for a plan that comes closer than is ever flown.
 
     - Without the gate: a plan may move far away from a guess that stands still, while half-spaces far from the guess
       are left out. It then runs into peers that are there by the time it arrives, as does the next from that guess.
     - With the harder braking that peers expect beyond the horizon: room to stop has much slack where peers are on
-      several sides, and one slack for each of them lets a plan come too close within the horizon as well. Only for
-      plans that are refused: agents that fly with less room to stop lack it when a peer drops out.
+      several sides, and one slack for each of them lets a plan come too close within the horizon as well. Agents that
+      always fly with less room to stop lack it when a peer drops out.
     """
     every = separation.model_copy(update={"gate_m": math.inf})
-    yield every, lambda plan: _is_refused(plan) or plan.slack_m > _SLACK_M
-    yield every.model_copy(update={"stop_m_s2": separation.brake_m_s2}), _is_refused
-
-
-def _is_refused(plan: Plan) -> bool:
-    """Return whether a plan comes closer than is ever flown."""
-    return plan.status is PlanStatus.NOT_CERTIFIED
+    yield every
+    yield every.model_copy(update={"stop_m_s2": separation.brake_m_s2})
 
 
 def _are_equal(one: HalfSpaces, other: HalfSpaces) -> bool:
