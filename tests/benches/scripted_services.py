@@ -31,6 +31,12 @@ def land(*_):
 signal.signal(signal.SIGTERM, land)
 print('up', flush=True)
 """
+IGNORES_SIGTERM = """
+import signal, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print('up', flush=True)
+time.sleep(60)
+"""
 FLIES_LONG = LANDS_ON_SIGTERM + "time.sleep(60)"
 
 
@@ -73,6 +79,7 @@ class ScriptedServices(Services):
         self.behind_us = 0  # by how much the agents' clock is behind ours
         self.obeys = True
         self.phase = Phase.TRACK
+        self.phases: dict[int, Phase] = {}  # of agents whose phase is another one
         self.held = False
         self.act: Callable[[], None] = lambda: None
         self.began_s = time.monotonic()
@@ -112,7 +119,7 @@ class ScriptedServices(Services):
             if any(order.verb == "land" for order in orders) and self.obeys and i not in self.silent:
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:
-                bus.publish(STATUS, status_of(i, self.phase, now_us - self.behind_us, self.held))
+                bus.publish(STATUS, status_of(i, self.phases.get(i, self.phase), now_us - self.behind_us, self.held))
         if time.monotonic() - self.began_s > 0.3:
             act, self.act = self.act, lambda: None
             act()

@@ -25,7 +25,7 @@ from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
 from swarmctl.telemetry.recording.run_files import read_events
-from tests.benches.scripted_services import FLIES_LONG, ScriptedServices, ends
+from tests.benches.scripted_services import FLIES_LONG, IGNORES_SIGTERM, ScriptedServices, ends
 
 pytestmark = pytest.mark.process
 
@@ -62,6 +62,18 @@ def test_all_agents_finish(tmp_path: Path) -> None:
     assert (result.outcome, result.problems) == ("completed", [])
     assert result.exit_code(violated=False) == EXIT_OK
     assert result.exit_code(violated=True) == EXIT_MISSION
+
+
+def test_who_has_landed_does_not_fail_because_it_waits_for_one_that_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where a pilot keeps one of two vehicles in the air after Ctrl-C."""
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_LAND_S", 2.0)
+    services = ScriptedServices(tmp_path, [IGNORES_SIGTERM, IGNORES_SIGTERM])
+    services.phases, services.obeys, services.interrupts = {0: Phase.DONE}, False, 1
+    problems = services.fly().problems
+    assert len([problem for problem in problems if agent_name(1) in problem]) == 2
+    assert not any(agent_name(0) in problem for problem in problems)
 
 
 def test_an_agent_that_ends_between_two_looks_still_says_how_it_ended(tmp_path: Path) -> None:

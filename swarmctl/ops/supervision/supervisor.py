@@ -293,9 +293,12 @@ class FlightSupervisor:
             return False  # it has ended since the agents were watched, and may say how the flight went
         if self._land_ordered_s is not None and now_s > self._land_until_s:
             for view in running:
-                if not self._recovery.is_on(view.agent):
-                    self._fail("not_landed", f"{agent_name(view.agent)} did not end in time and was killed")
-                kill_all([self._services.children[agent_name(view.agent)]])
+                child = self._services.children[agent_name(view.agent)]
+                if view.status is not None and view.status.phase == Phase.DONE:
+                    self._reported.add(_end_of(child))  # it only waits for who has not landed
+                elif not self._recovery.is_on(view.agent):
+                    self._fail("not_landed", f"{child.name} did not end in time and was killed")
+                kill_all([child])
             return not running
         if not running:
             deaths_s = [
