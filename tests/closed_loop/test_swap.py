@@ -62,7 +62,7 @@ def four_meet(fly: Fly, seed: int, *sets: str) -> Flight:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_four_agents_that_meet_keep_their_distance_from_every_start(fly: Fly, seed: int) -> None:
-    """The worst of 24 starts shifted by millimetres is 0.861 m."""
+    """The worst of 48 starts shifted by millimetres are 0.846 and 0.862 m."""
     assert four_meet(fly, seed).separation_m() >= 0.85
 
 
