@@ -111,8 +111,10 @@ def replaced(path: Path) -> Iterator[BinaryIO]:
     A symbolic link at `path` is itself replaced; its target stays as it is.
 
     Raises:
-        OSError: writing failed; the old file is untouched.
+        OSError: it is a folder, a device or a pipe, or writing failed; the old file is untouched.
     """
+    if path.exists() and not path.is_file():  # root would replace even /dev/null, or what a link to it is for
+        raise OSError(errno.EINVAL, "is not a regular file", str(path))
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     fd = os.open(part, _CREATE_FLAGS, 0o644)
     try:

@@ -106,6 +106,17 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
     assert [p.name for p in tmp_path.iterdir()] == ["summary.json"]
 
 
+def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
+    """Root replaced even /dev/null by a recording, and a folder without a name was a traceback."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    for path in (tmp_path / "pipe", tmp_path / "link", tmp_path, Path(), Path("/")):
+        with pytest.raises(OSError, match="is not a regular file"):
+            replace_text(path, "page")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "pipe"]
+    assert (tmp_path / "pipe").is_fifo() and (tmp_path / "link").is_symlink()
+
+
 def test_text_with_lone_surrogates_is_written(tmp_path: Path) -> None:
     replace_text(tmp_path / "a", "lone \ud800 surrogate")
     assert (tmp_path / "a").read_text() == "lone ? surrogate"
