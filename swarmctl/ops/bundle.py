@@ -70,16 +70,19 @@ def bundle(options: BundleOptions) -> Bundle:
     try:
         with ended_cleanly, tempfile.TemporaryDirectory(prefix="swarm-bundle-") as scratch:
             vehicles = _vehicles(config, options, Path(scratch))
+            recorded = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.is_symlink()]
             with replaced(output) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
                 archive.writestr("versions.json", _json(_versions()))
                 archive.writestr("vehicles.json", _json(vehicles))
-                for path in sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink()):
-                    if path != output:
+                for path in recorded:  # listed before the archive began, which may be among them
+                    if path != output.resolve():
                         archive.write(path, Path(folder.name) / path.relative_to(folder))
                 for path in sorted(Path(scratch).iterdir()):
                     archive.write(path, Path("logs") / path.name)
     except OSError as error:
-        raise StartError(f"{output}: can't be written: {error}. Choose another with --output") from error
+        raise StartError(
+            f"{output}: can't be written: {error.strerror or error}. Choose another with --output"
+        ) from error
     return Bundle(output, {agent: told["problem"] for agent, told in vehicles.items() if "problem" in told})
 
 

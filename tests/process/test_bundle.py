@@ -42,6 +42,16 @@ def test_a_run_of_the_built_in_simulator_is_packed_without_asking_anybody(tmp_pa
         assert "built-in simulator" in json.loads(archive.read("vehicles.json"))["agent-0"]["problem"]
 
 
+def test_an_archive_in_the_run_folder_holds_no_archive(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path, "[swarm]\nagents = 1\n")
+    for _ in range(2):  # the second one replaces what the first has written
+        done = bundle(folder, "--output", "a-run/b.zip")
+        assert done.returncode == 0, done.stderr
+    with zipfile.ZipFile(folder / "b.zip") as archive:
+        files = ["a-run/agent-0.parquet", "a-run/config.toml", "vehicles.json", "versions.json"]
+        assert sorted(archive.namelist()) == files
+
+
 def test_what_can_not_be_had_from_a_vehicle_is_named(tmp_path: Path) -> None:
     simulator = Simulator(1)
     try:
