@@ -50,6 +50,8 @@ def replay(
     """Open the recording of a run, or have its agents decide again."""
     from swarmctl.telemetry.view.recordings import RECORDING, open_viewer
 
+    if decide and web:
+        raise ConfigError("replay", ["--decide prints what it finds; leave --web out"])
     if decide:
         return _decide(folder, sets or [], as_json)
     if sets or as_json:

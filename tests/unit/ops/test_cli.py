@@ -261,6 +261,11 @@ def test_bad_usage_is_2(run: Run, capsys: pytest.CaptureFixture[str], arguments:
     assert "Traceback" not in capsys.readouterr().err
 
 
+def test_what_decides_again_serves_no_page(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("replay", "run", "--decide", "--web") == 2
+    assert "--web" in capsys.readouterr().err, "it was ignored"
+
+
 @pytest.mark.parametrize(
     ("error", "code"), [(ConfigError("file", ["a", "b"]), 2), (StartError("no"), 3), (MissionError("hit"), 4)]
 )
