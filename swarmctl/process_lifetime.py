@@ -1,4 +1,4 @@
-"""Ends child processes cleanly: with the launcher that started them (Linux only), or on a signal."""
+"""Starts child processes, and ends them cleanly: with the launcher that started them (Linux only), or on a signal."""
 
 from __future__ import annotations
 
@@ -13,6 +13,16 @@ from types import FrameType
 
 _PR_SET_PDEATHSIG = 1
 PARENT_ENV = "SWARMCTL_PARENT_PID"  # set by the launcher, so that a child notices a death before its own first check
+
+
+def module_command(module: str, *arguments: str) -> tuple[str, ...]:
+    """Return the command that runs a module of ours in another process.
+
+    Python files of the current folder, which may be named as a module that is imported, are no part of it, unless
+    this package is itself imported from there.
+    """
+    safe_path = () if Path(__file__).resolve().parents[1] == Path.cwd() else ("-P",)
+    return (sys.executable, *safe_path, "-m", module, *arguments)
 
 
 def die_with_parent(signum: int = signal.SIGTERM) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 from swarmctl.errors import (
@@ -23,6 +22,7 @@ from swarmctl.errors import (
     SwarmError,
 )
 from swarmctl.files import read_file
+from swarmctl.process_lifetime import module_command
 
 _FLEW = (EXIT_OK, EXIT_MISSION, EXIT_INTERRUPTED)  # exit codes of runs that were judged
 _MAX_LOG_BYTES = 2**24
@@ -37,7 +37,7 @@ class FlightProcess:
         self._log = folder / f"{name}.log"
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", *arguments],
+                module_command(*arguments),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

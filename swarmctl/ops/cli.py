@@ -26,6 +26,7 @@ from swarmctl.ops.verbs.keys import keys_app
 from swarmctl.ops.verbs.mission import mission_app
 from swarmctl.ops.verbs.obstacles import obstacle_app
 from swarmctl.ops.verbs.orders import AsJson, Run, add_order_verbs
+from swarmctl.process_lifetime import module_command
 
 if TYPE_CHECKING:
     from swarmctl.bus.messages.json_messages import StatusMessage
@@ -362,7 +363,7 @@ def campaign(context: typer.Context) -> NoReturn:
 def _become(module: str, arguments: list[str]) -> NoReturn:
     """Replace this process by a module of the simulator, which the bridge never imports."""
     sys.stdout.flush()
-    os.execv(sys.executable, [sys.executable, "-m", module, *arguments])
+    os.execv(sys.executable, [*module_command(module, *arguments)])
 
 
 def _overrides(agents: int | None, duration: float | None, seed: int | None, sets: list[str] | None) -> list[str]:

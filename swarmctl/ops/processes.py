@@ -28,7 +28,7 @@ from swarmctl.config import Config
 from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.text import printable
 from swarmctl.errors import StartError
-from swarmctl.process_lifetime import PARENT_ENV
+from swarmctl.process_lifetime import PARENT_ENV, module_command
 
 ROUTER = "router"
 SITL = "sitl"
@@ -74,7 +74,7 @@ def wants_realtime(config: Config, agents: Sequence[int]) -> bool:
 
 def router_command(config: Config, context: RunContext, links: RouterLinks | None) -> Command:
     """Return the command of the bus router, with its links to other computers if there are any."""
-    argv = _python("-m", "swarmctl.bus.network.router", context.endpoint, "--die-with-parent")
+    argv = module_command("swarmctl.bus.network.router", context.endpoint, "--die-with-parent")
     argv += links.arguments() if links is not None else ()
     return Command(ROUTER, (*argv, _priority_flag(config, context)))
 
@@ -98,7 +98,7 @@ def agent_commands(
     """
     commands = []
     for place, agent in enumerate(context.agents):
-        argv = _python("-m", "swarmctl", "agent", "--config", f"{config_path or context.directory / 'config.toml'}")
+        argv = module_command("swarmctl", "agent", "--config", f"{config_path or context.directory / 'config.toml'}")
         argv += ("--id", f"{agent}")
         argv += ("--run", context.run, "--bus", context.endpoint, "--run-dir", f"{context.directory}")
         fds = (sockets[place].fileno(),) if sockets else ()
@@ -114,8 +114,8 @@ def sitl_command(
     config: Config, context: RunContext, ports: Sequence[int], sockets: Sequence[socket.socket] = ()
 ) -> Command:
     """Return the command of the built-in simulator, which sends from `sockets`, or own ports, to loopback `ports`."""
-    argv = _python(
-        "-m", "sitl", "--config-json", config.simulator(context.agents).model_dump_json(exclude_defaults=True)
+    argv = module_command(
+        "sitl", "--config-json", config.simulator(context.agents).model_dump_json(exclude_defaults=True)
     )
     argv += ("--remote-ports", ",".join(str(port) for port in ports))
     fds = tuple(sock.fileno() for sock in sockets)
@@ -133,7 +133,7 @@ def control_socket(endpoint: str) -> Path:
 
 def viewer_command(config: Config, context: RunContext, port: int, *, view: bool, web: bool) -> Command:
     """Return the command of the viewer process, which owns rerun; it may open a window, and serve a page."""
-    argv = _python("-m", "swarmctl.telemetry.view.viewer", "--run", context.run, "--bus", context.endpoint)
+    argv = module_command("swarmctl.telemetry.view.viewer", "--run", context.run, "--bus", context.endpoint)
     argv += ("--flight", viewed_flight(config).model_dump_json(), "--run-dir", f"{context.directory}")
     argv += ("--port", f"{port}", "--rate-hz", f"{config.telemetry.rate_hz!r}", "--die-with-parent")
     argv += ("--history-mb", f"{config.telemetry.history_mb}")
@@ -144,10 +144,6 @@ def viewer_command(config: Config, context: RunContext, port: int, *, view: bool
 def _priority_flag(config: Config, context: RunContext) -> str:
     """Return the flag of a process that delays setpoints, predicted paths or vehicle states when it has to wait."""
     return "--realtime" if wants_realtime(config, context.agents) else "--no-realtime"
-
-
-def _python(*arguments: str) -> tuple[str, ...]:
-    return (sys.executable, *arguments)
 
 
 class Child:

@@ -1,4 +1,4 @@
-"""A request to stop arrives whatever the waiting thread is just doing."""
+"""Child processes are our own modules, and a request to stop arrives whatever the waiting thread is just doing."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
-from swarmctl.process_lifetime import PARENT_ENV, StopRequest
+import pytest
+
+import swarmctl
+from swarmctl.process_lifetime import PARENT_ENV, StopRequest, module_command
 
 # A signal at a random moment of `wait`, over and over. An Event hangs here within some dozen rounds.
 _STORM = """
@@ -76,3 +80,26 @@ def test_a_child_whose_launcher_lives_goes_on() -> None:
     environment = {**os.environ, PARENT_ENV: str(os.getpid())}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
     assert done.stdout.splitlines() == ["flies on"]
+
+
+def test_files_of_the_current_folder_take_the_place_of_no_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A `queue.py` beside an own controller: pyarrow could not be imported, so that nothing flew, or had no view."""
+    (tmp_path / "queue.py").write_text("raise SystemExit('imported')\n")
+    monkeypatch.chdir(tmp_path)
+    command = module_command("sitl.simulate", "--help")
+    where = {**os.environ, "PYTHONPATH": str(Path(swarmctl.__file__).parents[1])}
+    done = subprocess.run(command, env=where, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    control = [sys.executable, "-m", "queue"]
+    assert subprocess.run(control, capture_output=True, text=True, timeout=60).stderr == "imported\n"
+
+
+def test_from_its_own_checkout_the_package_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(Path(swarmctl.__file__).parents[1])
+    without = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        module_command("swarmctl", "--version"), env=without, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr

@@ -19,7 +19,7 @@ from urllib.parse import quote
 import psutil
 
 from swarmctl.errors import StartError
-from swarmctl.process_lifetime import PARENT_ENV, die_with_parent
+from swarmctl.process_lifetime import PARENT_ENV, die_with_parent, module_command
 from swarmctl.telemetry.view.recordings import viewer_binary
 from swarmctl.telemetry.view.view_ports import HOST, free_view_ports
 
@@ -52,8 +52,8 @@ def web_page(target: str, log: Path | None = None) -> Iterator[WebPage]:
     if not port or not data_port:
         raise StartError(f"no free port from {_FIRST_PAGE_PORT} or {_FIRST_DATA_PORT} on for a page on {HOST}")
     source = target if is_live else f"rerun+http://{HOST}:{data_port}/proxy"
-    command = [sys.executable, "-m", __name__, "--serve-web", "--bind", HOST, "--web-viewer-port", f"{port}"]
-    command += [target] if is_live else ["--port", f"{data_port}", target]
+    command = module_command(__name__, "--serve-web", "--bind", HOST, "--web-viewer-port", f"{port}")
+    command += (target,) if is_live else ("--port", f"{data_port}", target)
     environment = os.environ | {PARENT_ENV: f"{os.getpid()}"}
     with (log or Path(os.devnull)).open("ab") as output:
         process = subprocess.Popen(
