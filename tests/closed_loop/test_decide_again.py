@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,6 +62,21 @@ def test_the_same_agent_decides_the_same_in_every_phase(folder: Path) -> None:
         assert agent.thrust_01["max"] < 1e-3
         assert not agent.differences
         assert lines_of(agent)[0].startswith(f"agent-{agent.agent}: {agent.compared} ticks")
+
+
+def test_frames_that_a_tick_reads_after_its_begin_are_known_in_it(folder: Path, tmp_path: Path) -> None:
+    """As in a launch, where reading takes time: every frame was given to the next tick, and each decision came late."""
+    late = shutil.copytree(folder, tmp_path / "late")
+    for path in late.glob("agent-*.tlog"):
+        recorded, later_us, at = bytearray(path.read_bytes()), 300, 0
+        while at < len(recorded):
+            (utc_us,) = struct.unpack_from(">Q", recorded, at)
+            struct.pack_into(">Q", recorded, at, utc_us + later_us)
+            version_2 = recorded[at + 8] == 0xFD
+            at += 8 + recorded[at + 9] + (12 if version_2 else 8)
+        path.write_bytes(recorded)
+    for agent in decisions_of_run(late, ()):
+        assert not agent.differences
 
 
 def test_another_parameter_is_seen_where_it_matters(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shlex
@@ -27,6 +28,7 @@ from swarmctl.mavlink.signing.key_file import write_new_key
 from swarmctl.mavlink.signing.refusals import OLD, REPLAYED
 from swarmctl.ops.cli import main
 from swarmctl.ops.decide.inputs import frames_of
+from swarmctl.ops.decide.verb import decisions_of_run
 from swarmctl.ops.processes import wants_realtime
 from swarmctl.ops.running_launches import LAUNCH_FILE
 from swarmctl.process_priority import is_realtime_permitted
@@ -90,6 +92,9 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     received = re.search(r"received=(\d+)", (launched.run_dir / "viewer.log").read_text())
     assert received
     assert int(received[1]) > 300, "the viewer saw the ticks"
+    for agent in decisions_of_run(launched.run_dir, ()):
+        assert agent.phases_differ + agent.plans_differ <= 0.01 * agent.compared, "each frame came a tick late"
+        assert math.degrees(agent.tilt_rad["p50"]) < 1.0
 
 
 def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start, tmp_path: Path) -> None:

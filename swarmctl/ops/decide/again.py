@@ -104,13 +104,25 @@ def decide_again(
     from_vehicle = _InTime(frames)
     from_peers = _InTime(peer_messages(config, agent, run.ticks, plans))
     from_operator = _InTime(operator_messages(config, agent, run.ticks, run.events))
-    for row, begin_us in zip(rows, begins_utc_us(rows).tolist(), strict=True):
-        clock.t_us, clock.utc, end_us = int(row["t_us"]), begin_us, int(row["utc_us"]) + 1
-        link.offer([frame for _, frame in from_vehicle.before(end_us)], clock.t_us)  # stamped when the tick has read it
-        for _, topic, sender, payload in (*from_peers.before(begin_us), *from_operator.before(end_us)):
+    begins_us, arrived_us = begins_utc_us(rows).tolist(), _arrived_us(rows).tolist()
+    for row, begin_us, next_us, frames_us in zip(rows, begins_us, [*begins_us[1:], np.inf], arrived_us, strict=True):
+        clock.t_us, clock.utc = int(row["t_us"]), begin_us
+        link.offer([frame for _, frame in from_vehicle.before(next_us)], frames_us)  # stamped when this tick read them
+        for _, topic, sender, payload in (*from_peers.before(begin_us), *from_operator.before(next_us)):
             bus.offer(topic, sender, payload)
         flown.tick(clock.t_us, int(row["deadline_misses"]))
     return np.concatenate(sink.rows) if sink.rows else np.zeros(0, TICK_DTYPE)
+
+
+def _arrived_us(rows: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return the times (T,) [us] at which the frames that each tick read had arrived: that of its state, if it is new.
+
+    Frames are stamped when they are read, but wait for a tick for up to 20 ms, by which a state is older.
+    """
+    t_us = rows["t_us"]
+    age_us = np.nan_to_num(rows["state_age_ms"] * 1e3, nan=np.inf)
+    is_new = age_us < np.diff(t_us, prepend=t_us[:1])
+    return np.asarray(t_us - np.where(is_new, age_us, 0.0).round().astype(np.int64))
 
 
 class _InTime(Generic[T]):
@@ -119,7 +131,7 @@ class _InTime(Generic[T]):
     def __init__(self, items: Sequence[T]) -> None:
         self._items, self._next = items, 0
 
-    def before(self, utc_us: int) -> list[T]:
+    def before(self, utc_us: float) -> list[T]:
         """Return the items before a time that have not been handed out."""
         first = self._next
         while self._next < len(self._items) and self._items[self._next][0] < utc_us:

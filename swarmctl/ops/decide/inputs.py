@@ -130,8 +130,8 @@ def frames_of(recorded: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def begins_utc_us(rows: NDArray[np.void]) -> NDArray[np.int64]:
-    """Return the UTC (T,) [us] at which ticks have begun: rows hold that of their end, and both monotonic and UTC time
-    go on alike over a second.
+    """Return the UTC (T,) [us] at which ticks have begun: rows of older recordings hold that of their end, and both
+    monotonic and UTC time go on alike over a second.
     """
     late_us = np.pad(rows["utc_us"] - rows["t_us"], _SECOND_TICKS // 2, mode="edge")
     least_us = np.lib.stride_tricks.sliding_window_view(late_us, _SECOND_TICKS + 1).min(axis=1)
