@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Generic, Self, TypeVar
@@ -15,13 +16,26 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sitl.studies.campaign.trials import SCHEMA, Row, Trial, trial_of
-from swarmctl.errors import ConfigError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replaced
 
 ROWS = "rows.parquet"
 _SAVE_EVERY_S = 1.0
 _MAX_BYTES = 2**31
 _Job = TypeVar("_Job")  # what is flown, and its result told from others by
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Tell in words what the disk refuses in this block.
+
+    Raises:
+        StartError: `path` can't be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise StartError(f"{path}: can't be written: {error.strerror or error}. Choose another with --out") from error
 
 
 class RowStore(Generic[_Job]):
@@ -36,6 +50,7 @@ class RowStore(Generic[_Job]):
 
     Raises:
         ConfigError: the folder holds something else, or rows of other sources.
+        StartError: the folder, or later its file, can't be written.
     """
 
     def __init__(
@@ -44,7 +59,8 @@ class RowStore(Generic[_Job]):
         self._path = directory / ROWS
         self._schema, self._job_of = schema, job_of
         self.rows: list[Row] = []
-        directory.mkdir(parents=True, exist_ok=True)
+        with writing(directory):
+            directory.mkdir(parents=True, exist_ok=True)
         if self._path.exists():
             self.rows = _read(self._path, schema.names)
         others = sorted({row["code"] for row in self.rows} - {code})
@@ -83,7 +99,7 @@ class RowStore(Generic[_Job]):
         self._saved_s = time.monotonic()
         if len(self.rows) == self._saved_rows:
             return
-        with replaced(self._path) as file:
+        with writing(self._path), replaced(self._path) as file:
             pq.write_table(pa.Table.from_pylist(self.rows, self._schema), file)
         self._saved_rows = len(self.rows)
 

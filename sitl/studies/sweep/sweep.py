@@ -15,7 +15,7 @@ from rich.table import Table
 
 from sitl.studies.campaign.progress import collect
 from sitl.studies.campaign.source import code_id
-from sitl.studies.campaign.store import ROWS, RowStore
+from sitl.studies.campaign.store import ROWS, RowStore, writing
 from sitl.studies.campaign.worker_pool import on_this_machine
 from sitl.studies.sweep.figures import FIGURES, SHOWN, Combination, Row, combinations, schema_of
 from sitl.studies.sweep.flight import FlySweep
@@ -50,15 +50,16 @@ def sweep(options: SweepOptions) -> int:
 
     Raises:
         ConfigError: a combination is impossible, or the folder holds another sweep.
-        StartError: a process ended by itself.
+        StartError: a process ended by itself, or the folder can't be written.
     """
     base = load(options.config, options.fixed)
     axes = parse_axes(options.sets, options.fixed)
     flights = flights_of(axes, base.seed if options.first_seed is None else options.first_seed, options.seeds)
     if problems := list(problems_of(flights, options.config, options.fixed)):
         raise ConfigError("sweep", problems)
-    options.out.mkdir(parents=True, exist_ok=True)
-    _claim(options.out, base)
+    with writing(options.out):
+        options.out.mkdir(parents=True, exist_ok=True)
+        _claim(options.out, base)
     began_s, keyed = time.monotonic(), {_key(axes, flight): flight for flight in flights}
     with RowStore(options.out, code_id(), schema=schema_of(axes), job_of=partial(_key_of_row, axes)) as store:
         todo = [keyed[key] for key in store.missing(keyed)]

@@ -177,6 +177,6 @@ def run(options: argparse.Namespace) -> int:
     if options.jobs < 1:
         raise ConfigError("--jobs", [f"{options.jobs}: at least 1 process flies"])
     chosen(options.only, options.plant, options.full)
-    directory = options.out or create_run_folder(None, "reproduce", utc_us())
+    directory = options.out or create_run_folder(None, "reproduce", utc_us(), advice="Choose another with --out")
     _make(directory)
     return reproduce(options.only, options.plant, options.full, directory, processes=options.jobs)

@@ -39,13 +39,16 @@ from swarmctl.telemetry.report.run_report import FIGURES, REPORT, write_figures,
 _LAUNCHES_PER_SECOND = 1000
 
 
-def create_run_folder(base: Path | None, name: str, utc_us: int) -> Path:
+def create_run_folder(
+    base: Path | None, name: str, utc_us: int, *, advice: str = "Choose another with --run-dir"
+) -> Path:
     """Create and return the folder of a new run.
 
     Args:
         base: the folder itself; None for `runs/<UTC>-<name>`, with a number appended if that name is taken.
         name: name of the configuration.
         utc_us: start of the run [us since 1970].
+        advice: what to do where it can't be made.
 
     Raises:
         ConfigError: `base` contains a run already, or a symbolic link through which files would be written.
@@ -62,7 +65,7 @@ def create_run_folder(base: Path | None, name: str, utc_us: int) -> Path:
                 path.mkdir(exist_ok=False)
                 return path
     except OSError as error:
-        raise StartError(f"run folder can't be made: {error}. Choose another with --run-dir") from error
+        raise StartError(f"run folder can't be made: {error}. {advice}") from error
     raise StartError(f"runs/{stamp}-{name}: {_LAUNCHES_PER_SECOND} launches in one second")
 
 

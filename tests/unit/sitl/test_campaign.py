@@ -246,3 +246,10 @@ def test_a_partitioned_bus_delivers_nothing() -> None:
     assert one.alive() == {"agent-0", "agent-1"}
     assert other.receive(topics.PATH) == []
     assert other.receive(topics.COMMAND) == [("agent-0", b"kept")]
+
+
+def test_a_folder_that_can_not_be_made_is_3_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["--scenario", "swap", "--trials", "1", "--out", str(tmp_path / "file" / "out")]) == 3
+    said = capsys.readouterr().err
+    assert said == f"{tmp_path}/file/out: can't be written: Not a directory. Choose another with --out\n"

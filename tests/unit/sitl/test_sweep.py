@@ -179,3 +179,10 @@ def test_a_flight_that_cannot_be_flown_is_told_and_flown_again(
     assert "--set separation.radius_m=0.9 --seed 1: RuntimeError: no such luck" in capsys.readouterr().err
     assert run(tmp_path, RADIUS) == 4
     assert "0 of them there already" in capsys.readouterr().out
+
+
+def test_a_folder_that_can_not_be_made_is_3_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["--set", "sitl.mass_scale=1", "--out", str(tmp_path / "file" / "out")]) == 3
+    said = capsys.readouterr().err
+    assert said == f"{tmp_path}/file/out: can't be written: Not a directory. Choose another with --out\n"
