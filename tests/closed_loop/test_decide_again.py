@@ -112,6 +112,11 @@ def test_what_can_not_be_decided_again_is_refused(folder: Path, tmp_path: Path) 
         decisions_of_run(folder, ["swarm.agents=1", "mission.kind=hover"])
     with pytest.raises(ConfigError, match="is no run folder"):
         decisions_of_run(tmp_path, ())
+    begun = tmp_path / "begun"  # what a simulation that was killed leaves
+    begun.mkdir()
+    shutil.copy(folder / "config.toml", begun)
+    with pytest.raises(ConfigError, match="holds no ticks of an agent"):
+        decisions_of_run(begun, ())
     bare = shutil.copytree(folder, tmp_path / "bare")
     (bare / "agent-0.tlog").unlink()
     with pytest.raises(ConfigError, match=r"agent-0\.tlog: can't be read"):

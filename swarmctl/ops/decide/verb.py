@@ -29,6 +29,8 @@ def decisions_of_run(directory: Path, overrides: Sequence[str]) -> list[Decision
     run = load_run(directory)
     if config.swarm.agents != flown.swarm.agents:
         raise ConfigError("--set", [f"swarm.agents is that of the run, {flown.swarm.agents}"])
+    if not run.ticks:
+        raise ConfigError(str(directory), ["holds no ticks of an agent, so that there is nothing to decide again"])
     plans = {agent: read_plans(directory, agent) for agent in run.ticks}
     return [
         compare(rows, decide_again(directory, config, run, plans, agent), agent) for agent, rows in run.ticks.items()
