@@ -34,7 +34,7 @@ from swarmctl.process_lifetime import StopRequest
 if TYPE_CHECKING:
     from swarmctl.check.ground_services import GroundVehicle
 
-_SIMULATED = "the built-in simulator has ended, and keeps no logs"
+_SIMULATED = "the built-in simulator keeps no logs"
 _SIGNED = "it signs its link, and a bundle reads no key file that a run folder names; take its logs by a ground station"
 _CONNECT_S, _LISTEN_S, _LONGER_S = 5.0, 1.0, 10.0
 _PACKAGES = ("numpy", "scipy", "osqp", "pymavlink", "mavsdk", "eclipse-zenoh", "msgspec", "pyarrow", "rerun-sdk")
