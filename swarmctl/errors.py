@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from swarmctl.core.text import printable, printable_lines
+from swarmctl.standard_streams import prepare_standard_streams
 
 EXIT_OK = 0
 EXIT_USAGE = 2
@@ -49,6 +50,7 @@ class MissionError(SwarmError):
 
 def exit_code_of(run: Callable[[], int], when_interrupted: str = "") -> int:
     """Run `run` and return its exit code; errors go to standard error, Ctrl-C gives `EXIT_INTERRUPTED`."""
+    prepare_standard_streams()
     try:
         return run()
     except SwarmError as error:

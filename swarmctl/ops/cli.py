@@ -27,6 +27,7 @@ from swarmctl.ops.verbs.mission import mission_app
 from swarmctl.ops.verbs.obstacles import obstacle_app
 from swarmctl.ops.verbs.orders import AsJson, Run, add_order_verbs
 from swarmctl.process_lifetime import module_command
+from swarmctl.standard_streams import prepare_standard_streams
 
 if TYPE_CHECKING:
     from swarmctl.bus.messages.json_messages import StatusMessage
@@ -65,6 +66,7 @@ _PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True, "help_opti
 
 def main() -> None:
     """Run the command line: print expected errors and return their exit code, let unexpected ones raise."""
+    prepare_standard_streams()
     code = _run_app()
     try:
         sys.stdout.flush()
