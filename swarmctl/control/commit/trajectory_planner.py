@@ -16,7 +16,7 @@ from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOut, KeepOut
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import AxisWeights, MpcParams, SwarmMpc
-from swarmctl.control.reference.quintic import brake_to_rest, quintic_to
+from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
@@ -28,6 +28,8 @@ _BRAKE_POINTS_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # shares of the plan after which
 _MIN_GAIN_M = 0.02  # clearance an evasive trajectory has to gain over the committed one
 _LEAST_COS_TILT = 0.5  # at the start of a plan, as its bounds on tilt allow
 _CLIMB_M_S, _CLIMB_M_S2 = 2.0, 2.0
+_WAY_S, _WAY_M_S, _WAY_M_S2 = 1.0, 0.5, 0.5  # how far ahead on a path around something, and how fast it is gone to
+_WAY_TURNS_RAD = (0.0, 0.3, -0.3, 0.6, -0.6)
 _FOLLOWING_MOVES_Z = 10
 _RUN_UP_M_S2 = 0.8  # acceleration along a path up to its own speed
 _BRAKING_TAIL_S = 2.0  # part of the final braking that is checked against keep-outs
@@ -144,6 +146,8 @@ class TrajectoryPlanner:
             speed_m_s = float(np.linalg.norm(committed.sample(np.array([now.begin_us]))[1]))
             slower = replace(now, desired=_with_run_up(now.desired, speed_m_s))
             found = self._clear(committed, self._planned(committed, slower), slower)
+            ways = self._ways_along_path(committed, now) if found is None else iter(())
+            found = next((way for leaving in ways if (way := self._checked(committed, leaving, now))), found)
         return found
 
     def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
@@ -198,11 +202,23 @@ class TrajectoryPlanner:
         """Return the committed trajectory, left at `begin_us` for a climb by `height_m` over where it would stop."""
         pos, vel = (found[0] for found in committed.sample(np.array([begin_us])))
         above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m - [0.0, 0.0, height_m]
-        trajectory = quintic_to(pos, vel, above, _CLIMB_M_S, accel_m_s2=_CLIMB_M_S2)
-        ahead_s = self._params.dt_s * np.arange(
-            math.ceil(trajectory.travel_s / self._params.dt_s) + 1, dtype=np.float64
-        )
-        pos_m, vel_m_s = trajectory.sample(ahead_s)
+        return self._on_grid(quintic_to(pos, vel, above, _CLIMB_M_S, accel_m_s2=_CLIMB_M_S2), begin_us)
+
+    def _ways_along_path(self, committed: Trajectory, now: Situation) -> Iterator[Trajectory]:
+        """Yield straight ways as the path around what blocks the agent begins, and on either side of that.
+
+        Between two keep-outs the MPC trades the room to one for that to the other, and every plan is refused for it.
+        """
+        pos, vel = (found[0] for found in committed.sample(np.array([now.begin_us])))
+        north_m, east_m, down_m = now.desired.reference(np.array([_WAY_S]))[0][0] - pos
+        for turn_rad in _WAY_TURNS_RAD:
+            c, s = math.cos(turn_rad), math.sin(turn_rad)
+            ahead = pos + np.array([c * north_m - s * east_m, s * north_m + c * east_m, down_m])
+            yield self._on_grid(quintic_to(pos, vel, ahead, _WAY_M_S, accel_m_s2=_WAY_M_S2), now.begin_us)
+
+    def _on_grid(self, trajectory: QuinticTrajectory, begin_us: int) -> Trajectory:
+        steps = math.ceil(trajectory.travel_s / self._params.dt_s)
+        pos_m, vel_m_s = trajectory.sample(self._params.dt_s * np.arange(steps + 1, dtype=np.float64))
         return ending_at_rest(begin_us, self.dt_us, pos_m, vel_m_s, brake_m_s2=self._params.brake_m_s2)
 
     def _planned(self, committed: Trajectory, now: Situation) -> Plan | None:
@@ -246,7 +262,6 @@ class TrajectoryPlanner:
         """Return the longest part of a plan that is clear of everything known when followed by braking, or None."""
         if plan is None:
             return None
-        known = now.followed
         for share in _BRAKE_POINTS_01:
             end = max(1, round(share * self._mpc.steps)) + 1
             braked = ending_at_rest(
@@ -256,12 +271,16 @@ class TrajectoryPlanner:
                 plan.vel_ned_m_s[:end],
                 brake_m_s2=self._params.brake_m_s2,
             )
-            whole = joined(committed, braked, now.utc_us)
-            if not self._stays_in_volume(whole, committed, now.utc_us):
-                continue
-            if self.is_clear(whole, now) and not self.conflicts(whole, now.utc_us, known, _INTERPOLATION_MARGIN_M):
+            if (whole := self._checked(committed, braked, now)) is not None:
                 return whole
         return None
+
+    def _checked(self, committed: Trajectory, leaving: Trajectory, now: Situation) -> Trajectory | None:
+        """Return the committed trajectory, left for another one, if that is clear of everything known, or None."""
+        whole = joined(committed, leaving, now.utc_us)
+        if not self._stays_in_volume(whole, committed, now.utc_us) or not self.is_clear(whole, now):
+            return None
+        return None if self.conflicts(whole, now.utc_us, now.followed, _INTERPOLATION_MARGIN_M) else whole
 
     def _stays_in_volume(self, trajectory: Trajectory, committed: Trajectory, utc_us: int) -> bool:
         """Tell whether a trajectory stays in the flight volume, or goes no farther out of it than `committed` does."""

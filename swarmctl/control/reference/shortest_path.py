@@ -2,7 +2,8 @@
 
 Only an agent that stands before something asks for it (`swarmctl.control.reference.deadlock`): the MPC looks 0.8 s
 ahead and cannot know on which side a wall ends. Cells inside a disc are passable at a price, so there is always an
-answer, also from inside a disc and through gaps that the grid is too coarse for.
+answer, also from inside a disc and through gaps that the grid is too coarse for. Between discs that overlap there is
+no gap: who stands there already, as far from either end of it, would else try to squeeze through for ever.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import itertools
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -19,6 +21,8 @@ from swarmctl.core.types import Array
 _CELLS = 60  # along the longer side
 _EDGE_CELLS = 0.7  # a cell this far inside a disc may still hold a free point
 _PRICE_INSIDE = 1000.0  # price of a metre farther inside, or outside of the sides
+_PRICE_THROUGH = 1e5  # price of a metre between two discs that overlap
+_NEAREST = 9  # cells among which that of a place is chosen
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
@@ -85,13 +89,14 @@ def shortest_path(
     price = np.ones(len(points))
     for x, y, radius in discs:
         distance = np.hypot(points[:, 0] - x, points[:, 1] - y)
-        price[distance < radius] = np.maximum(price[distance < radius], squeeze)
+        price[distance < radius] = np.maximum(price[distance < radius], min(squeeze, _PRICE_INSIDE))
         price[distance < radius - _EDGE_CELLS * step_m] = _PRICE_INSIDE
     if sides is not None:
         price[(points @ sides[0].T < sides[1]).any(axis=1)] = _PRICE_INSIDE
-    first = int(np.argmin(((points - start) ** 2).sum(axis=1)))
-    last = int(np.argmin(((points - goal) ** 2).sum(axis=1)))
-    _, before = dijkstra(_edges(price, shape, step_m), directed=False, indices=last, return_predecessors=True)
+    walls = _walls(discs)
+    first, last = _nearest(points, start, walls), _nearest(points, goal, walls)
+    edges = _edges(price, points, walls, shape=shape, step_m=step_m)
+    _, before = dijkstra(edges, directed=False, indices=last, return_predecessors=True)
     cells = [first]
     while cells[-1] != last and before[cells[-1]] >= 0:
         cells.append(int(before[cells[-1]]))
@@ -122,18 +127,52 @@ def _grid(start: Array, goal: Array, discs: Array, cell_m: float) -> tuple[Array
     return low + step_m * np.stack([rows.ravel(), columns.ravel()], axis=1), shape, step_m
 
 
-def _edges(price: Array, shape: tuple[int, int], step_m: float) -> csr_array:
-    """Return edges between each cell and its eight neighbours, each edge once."""
+def _walls(discs: Array) -> Array:
+    """Return the segments (W, 2, 2) between the centres of discs that overlap: who passes between them crosses it."""
+    pairs = itertools.combinations(discs, 2)
+    found = [(a[:2], b[:2]) for a, b in pairs if math.dist(a[:2], b[:2]) < a[2] + b[2]]
+    return np.array(found).reshape(-1, 2, 2)
+
+
+def _nearest(points: Array, here: Array, walls: Array) -> int:
+    """Return the index of the point (K, 2) that is nearest to a place (2,) on its side of the walls near it."""
+    away2 = ((points - here) ** 2).sum(axis=1)
+    nearest = np.argsort(away2)[:_NEAREST]
+    beyond = np.zeros(len(nearest), dtype=bool)
+    for wall in walls:
+        beyond |= _crosses(np.tile(here, (len(nearest), 1)), points[nearest], wall)
+    return int(nearest[np.argmin(beyond)])
+
+
+def _edges(price: Array, points: Array, walls: Array, *, shape: tuple[int, int], step_m: float) -> csr_array:
+    """Return edges between each cell and its eight neighbours, each edge once; those through walls are the dearest."""
     index = np.arange(len(price)).reshape(shape)
     starts, ends, lengths = [], [], []
     for down, right in _NEIGHBOURS:
-        a = index[: shape[0] - down, max(0, -right) : shape[1] - max(0, right)].ravel()
-        b = index[down:, max(0, right) : shape[1] + min(0, right)].ravel()
-        starts.append(a)
-        ends.append(b)
-        lengths.append(step_m * math.hypot(down, right) * np.maximum(price[a], price[b]))
-    where = (np.concatenate(starts), np.concatenate(ends))
-    return csr_array((np.concatenate(lengths), where), shape=(len(price), len(price)))
+        starts.append(index[: shape[0] - down, max(0, -right) : shape[1] - max(0, right)].ravel())
+        ends.append(index[down:, max(0, right) : shape[1] + min(0, right)].ravel())
+        lengths.append(np.full(len(starts[-1]), step_m * math.hypot(down, right)))
+    start, end = np.concatenate(starts), np.concatenate(ends)
+    dear = np.maximum(price[start], price[end])
+    for wall in walls:
+        low, high = wall.min(axis=0) - 2.0 * step_m, wall.max(axis=0) + 2.0 * step_m
+        near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1)[start])
+        dear[near[_crosses(points[start[near]], points[end[near]], wall)]] = _PRICE_THROUGH
+    return csr_array((np.concatenate(lengths) * dear, (start, end)), shape=(len(price), len(price)))
+
+
+def _crosses(a: Array, b: Array, wall: Array) -> NDArray[np.bool_]:
+    """Return which of the segments from `a` to `b`, (K, 2) each, cross a wall (2, 2)."""
+    along = wall[1] - wall[0]
+    side_a, side_b = _cross(along, a - wall[0]), _cross(along, b - wall[0])
+    step = b - a
+    ends = _cross(step, wall[0] - a) * _cross(step, wall[1] - a)
+    found: NDArray[np.bool_] = (side_a * side_b <= 0.0) & (ends <= 0.0)
+    return found
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _tightened(points: Array, discs: Array) -> Polyline:

@@ -53,11 +53,22 @@ def test_the_path_leads_through_a_gap_in_a_wall() -> None:
     )
 
 
+def test_who_stands_in_a_gap_that_is_closed_is_led_back_and_around() -> None:
+    """It is as far through as back, and round the wall in any case farther."""
+    discs = np.vstack([wall(-2.4, -0.3), wall(0.3, 2.4)])
+    for north_m in (-0.15, -0.05):
+        path = shortest_path(np.array([north_m, 0.0]), GOAL, discs, 0.1, squeeze=3.0**9)
+        assert path.corners[1, 0] < north_m
+        assert np.abs(path.corners[:, 1]).max() > 2.4
+
+
 def test_a_doubtful_gap_is_avoided_at_a_higher_price() -> None:
-    """The middle of this one is 2 cm inside the discs of both sides, as far as a free one can be from a grid point."""
-    discs = np.vstack([wall(-2.48, -0.38), wall(0.38, 2.4)])
-    through, round_it = (shortest_path(START, GOAL, discs, 0.1, squeeze=squeeze) for squeeze in (3.0, 27.0))
-    assert np.abs(through.corners[:, 1]).max() < 0.2
+    """The grid has no point in the middle of this one, which is 2 cm wide."""
+    discs, aside = np.vstack([wall(-2.51, -0.41), wall(0.41, 2.4)]), np.array([0.0, 0.3])
+    through, round_it = (
+        shortest_path(START + aside, GOAL + aside, discs, 0.1, squeeze=squeeze) for squeeze in (3.0, 81.0)
+    )
+    assert np.abs(through.corners[:, 1]).max() < 0.4
     assert np.abs(round_it.corners[:, 1]).max() > 2.4
 
 
