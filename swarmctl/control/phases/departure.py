@@ -10,7 +10,8 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, VehicleState
 
 _MOST_NAMED = 4  # agents in one line
-LEAST_CLIMB_M = 0.5
+LEAST_CLIMB_M = 0.5  # of a configuration
+_REFUSED_CLIMB_M = 0.25  # heights are estimates: a start at the least height must not be refused for a few centimetres
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
 
 
@@ -60,9 +61,9 @@ class Climb:
     @property
     def too_low(self) -> str:
         """Return why the start can't be climbed to from where the vehicle stands, or ""."""
-        if self.height_m >= LEAST_CLIMB_M:
+        if self.height_m >= _REFUSED_CLIMB_M:
             return ""
-        found = f"its start is {self.height_m:.1f} m above the ground it stands on, less than {LEAST_CLIMB_M} m"
+        found = f"its start is {self.height_m:.2f} m above the ground it stands on, less than {LEAST_CLIMB_M} m"
         return f"{found}: raise the start (NED, down is positive) or correct swarm.origin_alt_m"
 
     def begin(self, state: VehicleState) -> None:

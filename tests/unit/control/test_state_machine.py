@@ -132,14 +132,14 @@ def test_no_agent_arms_before_all_stand_by(missing: str) -> None:
     assert Verb.ARM in flight.run(0.3)
 
 
-@pytest.mark.parametrize(("ground_z_m", "is_armed"), [(-2.4, True), (-2.6, False), (-8.0, False)])
+@pytest.mark.parametrize(("ground_z_m", "is_armed"), [(-2.4, True), (-2.6, True), (-2.8, False), (-8.0, False)])
 def test_who_stands_as_high_as_its_start_is_not_armed(ground_z_m: float, is_armed: bool) -> None:
     flight = Flight(peers=0)
     flight.pos = np.array([1.0, 0.0, ground_z_m])
     assert (Verb.ARM in flight.run(3.0)) == is_armed
     if not is_armed:
         assert flight.phase is Phase.DONE
-        assert f"its start is {3.0 + ground_z_m:.1f} m above the ground" in flight.mission.outcome
+        assert f"its start is {3.0 + ground_z_m:.2f} m above the ground" in flight.mission.outcome
 
 
 def test_arming_is_requested_once_a_second_and_never_while_a_command_is_open() -> None:
