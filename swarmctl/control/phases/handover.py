@@ -6,6 +6,7 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
 from swarmctl.core.types import Command, FlightMode, Mode, Phase, VehicleState, Verb
 
+_GONE_US = 3_000_000  # of a vehicle without positions; that its autopilot has rebooted is told later than its mode
 OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes that follow from our own requests
 
 
@@ -16,9 +17,12 @@ def is_under_other_control(state: VehicleState) -> bool:
 
 def is_taken_over(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> bool:
     """Return whether pilot or autopilot have taken over; where positions are stale, mode and arming may be new."""
-    if inputs.mode is Mode.STATE_STALE and mission.had_control and mission.phase < Phase.LAND:
-        return state.mode is not FlightMode.EXTERNAL or not state.armed
-    return inputs.mode is Mode.PILOT_OVERRIDE
+    stale = inputs.mode is Mode.STATE_STALE and mission.had_control and mission.phase < Phase.LAND
+    if not stale or (state.mode is FlightMode.EXTERNAL and state.armed):
+        mission.gone_us = None
+        return inputs.mode is Mode.PILOT_OVERRIDE
+    mission.gone_us = inputs.now_us if mission.gone_us is None else mission.gone_us
+    return inputs.now_us - mission.gone_us > _GONE_US
 
 
 def request_control(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:

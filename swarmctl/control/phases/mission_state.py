@@ -63,6 +63,7 @@ class MissionState:
         had_control: the autopilot follows our setpoints and control has not been given back.
         pilot_override: pilot or autopilot took over; lasts until an operator resumes.
         overridden_us: monotonic time of the last takeover.
+        gone_us: monotonic time from which a vehicle without positions has been out of our control; None: it is not.
         offered: the mission that the order `mission` has flown.
         stop_verb: land or rtl, from the command until the stop begins.
         may_take_control: an operator's resume permits taking control from any mode.
@@ -85,6 +86,7 @@ class MissionState:
         self.outcome = self.outcome_before = self.waits_for = self.stop_verb = ""
         self.ready_utc_us = self.ordered_begin_utc_us = self.entered_us = self.overridden_us = self.land_by_us = 0
         self.begin_utc_us: int | None = None
+        self.gone_us: int | None = None
         self.first_tick_us: int | None = None
         self.requested_us = -REQUEST_PERIOD_US
         self.offered: OfferedMission | None = None
