@@ -93,7 +93,7 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     assert received
     assert int(received[1]) > 300, "the viewer saw the ticks"
     for agent in decisions_of_run(launched.run_dir, ()):
-        assert agent.phases_differ + agent.plans_differ <= 0.01 * agent.compared, "each frame came a tick late"
+        assert agent.phases_differ <= 3, "each frame came a tick late, and with it every change of phase"
         assert math.degrees(agent.tilt_rad["p50"]) < 1.0
 
 
