@@ -146,8 +146,9 @@ class TrajectoryPlanner:
             speed_m_s = float(np.linalg.norm(committed.sample(np.array([now.begin_us]))[1]))
             slower = replace(now, desired=_with_run_up(now.desired, speed_m_s))
             found = self._clear(committed, self._planned(committed, slower), slower)
-            ways = self._ways_along_path(committed, now) if found is None else iter(())
-            found = next((way for leaving in ways if (way := self._checked(committed, leaving, now))), found)
+        if found is None and now.desired.follows_path:
+            checked = (self._checked(committed, way, now) for way in self._ways_along_path(committed, now))
+            found = next((way for way in checked if way is not None), None)
         return found
 
     def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:

@@ -6,7 +6,9 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
 from swarmctl.core.types import Command, FlightMode, Mode, Phase, VehicleState, Verb
 
-_GONE_US = 3_000_000  # of a vehicle without positions; that its autopilot has rebooted is told later than its mode
+# How long a vehicle without positions is in another mode, or disarmed, before that counts as a takeover: it may be a
+# reboot of its autopilot, which is told later than mode and arming.
+_GONE_US = 3_000_000
 OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes that follow from our own requests
 
 

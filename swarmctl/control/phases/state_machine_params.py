@@ -18,5 +18,5 @@ class StateMachineParams(Params):
     land_m: float = Field(0.06, gt=0, le=5)  # tolerance of the landing place; reduces the gap to neighbouring places
     land_m_s: float = Field(0.06, gt=0, le=5)  # largest speed above the landing place
     start_timeout_s: float = Field(90.0, gt=0, le=3600)  # from process start to TRACK
-    land_timeout_s: float = Field(20.0, gt=0, le=600)  # to be late at the landing place; then land where it is
+    land_timeout_s: float = Field(20.0, gt=0, le=600)  # allowed delay at the landing place; then land where it is
     apart_m: float = Field(0.2, ge=0, le=20)  # beyond separation.radius_m, around an agent that lands in place
