@@ -109,7 +109,7 @@ class Autopilot:
         self._estimate: Estimate | None = None
         self._cause: Cause | None = None
         self._refused_us = -REFUSED_EVERY_US
-        self._armed_us = self._next_check_us = self._aided_us = self._unaided_us = 0
+        self._armed_us = self._next_check_us = self._aided_us = self.unaided_us = 0
         self._resume_us: int | None = None
         self._delayed: tuple[int, Action] | None = None  # time and action after a delay in Hold
 
@@ -174,7 +174,7 @@ class Autopilot:
     @property
     def has_position(self) -> bool:
         """Whether there is a horizontal position, measured or dead-reckoned for a short while."""
-        return self.position_ok and self._unaided_us <= DEAD_RECKONING_US
+        return self.position_ok and self.unaided_us <= DEAD_RECKONING_US
 
     @property
     def position_ned_m(self) -> Triple | None:
@@ -337,7 +337,7 @@ class Autopilot:
             return
         estimate = self._estimate = self.boot.local(estimate)
         self._aided_us = now_us if estimate.gps_ok else self._aided_us
-        self._unaided_us = now_us - self._aided_us
+        self.unaided_us = now_us - self._aided_us
         if self.home_ned_m is None and self.has_position and self.ready(now_us):
             self.home_ned_m = estimate.pos_ned_m
         self._land_detector.update(estimate.on_ground, self._airborne_state(), now_us)

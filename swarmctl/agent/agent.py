@@ -247,6 +247,7 @@ class Agent:
             self._vehicle_watch.on_result(result, now_us)
         self._vehicle_watch.report_text()
         self._vehicle_watch.report_jump(now_us)
+        self._vehicle_watch.report_accuracy(now_us, is_standing=self._mission.phase < Phase.ARM)
         self._vehicle_watch.report_loss(now_us)
         if state is not None:
             self._own_state.update(state, autopilot.hover_thrust_01, controls=self._mission.had_control)
@@ -290,13 +291,13 @@ class Agent:
 
     def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
         """Publish the predicted path, and what the separation policy has to say."""
-        frame_margin_m = self._ports.autopilot.frame.margin_m
+        estimate_m = self._ports.autopilot.frame.margin_m + self._vehicle_watch.accuracy.margin_m
         self._path_publisher.publish(
             state,
             flown,
             self._publisher.seq,
             disturbance_ned_m_s2=self._own_state.estimate.disturbance_ned_m_s2,
-            margins_m=(frame_margin_m, self._deadlines.margin_m, self._planner.directive.margin_m),
+            margins_m=(estimate_m, self._deadlines.margin_m, self._planner.directive.margin_m),
         )
         self._separation.publish(self._ports.clock.utc_us())
         self._interest.update(state, self._ports.clock.utc_us())

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
+from swarmctl.control.estimation import accuracy
 from swarmctl.mavlink.vehicle import autopilot
 from tests.closed_loop.conftest import Flight, Fly
 
 AT_S = 3.0
-LANDED_M = 4.0  # from where it took off: lost 6 s, until the estimator has said so twice, and a blind descent
+LANDED_M = 4.0  # from where it took off: lost 6 s, until the estimator has said so, and a blind descent
+# It drifts towards the peer 1.2 m away, who gives way by what the estimator has told by then.
+BESIDE = ("swarm.agents=2", "mission.kind=hover", "mission.duration_s=15", "start.positions_ned_m=[[0,0,-2],[-1.2,0,-2]]")
+SEPARATION_M = 0.85
 
 
-def fly_without_gps(fly: Fly) -> Flight:
+ALONE = ("swarm.agents=1", "mission.kind=hover", "mission.duration_s=60")
+
+
+def fly_without_gps(fly: Fly, scene: Sequence[str] = ALONE) -> Flight:
     def lose(running: Lockstep) -> None:
         running.world.estimator.lose_gps(0)
 
-    return fly("swarm.agents=1", "mission.kind=hover", "mission.duration_s=60", at={AT_S: lose})
+    return fly(*scene, at={AT_S: lose})
 
 
 def strayed_m(flight: Flight) -> float:
@@ -40,3 +49,16 @@ def test_negative_control_a_lost_position_that_is_believed_is_followed(
     flight = fly_without_gps(fly)
     assert flight.outcomes == {"completed"}
     assert strayed_m(flight) > 5 * LANDED_M
+
+
+def test_peers_keep_away_from_who_drifts(fly: Fly) -> None:
+    flight = fly_without_gps(fly, BESIDE)
+    assert flight.separation_m() >= SEPARATION_M
+    assert flight.outcomes == {"completed", "pilot or autopilot took over"}
+
+
+def test_negative_control_who_drifts_comes_close_to_peers_that_are_not_told(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(accuracy, "_SIGMAS", 0.0)
+    assert fly_without_gps(fly, BESIDE).separation_m() < 0.6

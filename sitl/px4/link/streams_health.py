@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from sitl.px4.link.schedule import CURRENT_EVENT_SEQUENCE, ESC_INFO, ESC_STATUS, LINK_NODE_STATUS, SENSOR_FUSION
 from sitl.px4.link.streams import FLIGHT_STREAMS, NAN, Fields, LinkCounts, Report, Stream, home_z_m, int32, ms
-from sitl.px4.settling import claimed
+from sitl.px4.settling import claimed, unaided_m
 
 _SENSORS_PRESENT = 0x0300C02F
 _SENSORS_ENABLED = 0x0301C02F
@@ -129,6 +129,7 @@ def estimator_status(r: Report) -> Fields:
     e, pilot = r.estimate, r.autopilot
     horizontal_m, vertical_m = e.pos_accuracy_m
     horizontal_m, flags = claimed(horizontal_m, pilot.settled_share(e.t_us))
+    horizontal_m += unaided_m(pilot.unaided_us * 1e-6)
     if not pilot.has_position:
         flags &= ~_POSITION_ESTIMATED
     return e.t_us, 0.02, 0.02, 0.02, 0.01, 0.0, NAN, horizontal_m, vertical_m, flags

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from swarmctl.agent.ports import Ports
 from swarmctl.agent.watches.alerts import Alerts
+from swarmctl.control.estimation.accuracy import AccuracyMargin
 from swarmctl.core.types import Verb
 from swarmctl.mavlink.commands import CommandResult
 
@@ -16,10 +17,15 @@ class VehicleWatch:
     Args:
         ports: the vehicle; receives events of its requests, its words, its estimate, setpoints and frames.
         alerts: are told what an operator should know of them.
+
+    Attributes:
+        accuracy: what the estimate has lost of its accuracy in flight.
     """
 
+    accuracy: AccuracyMargin
+
     def __init__(self, ports: Ports, alerts: Alerts) -> None:
-        self._ports, self._alerts = ports, alerts
+        self._ports, self._alerts, self.accuracy = ports, alerts, AccuracyMargin()
         self._gaps = self._jumps = 0  # already reported
         self._is_lost = False  # as reported
         self._no_origin_us: int | None = None  # since when the vehicle does not tell its origin
@@ -59,6 +65,14 @@ class VehicleWatch:
         text = f"estimate jumped by {frame.jump_m:.1f} m: peers keep that much more away"
         self._alerts.put("jump", text, now_us)
         self._ports.note("estimate_jumped", metres=frame.jump_m)
+
+    def report_accuracy(self, now_us: int, *, is_standing: bool) -> None:
+        """Report that the vehicle's estimate has become inaccurate in flight, while it is."""
+        accuracy_m = self._ports.autopilot.pos_accuracy_m
+        self.accuracy.update(accuracy_m, is_standing=is_standing)
+        if accuracy_m is not None and self.accuracy.margin_m:
+            text = f"estimate is {accuracy_m:.1f} m off (rms): peers keep {self.accuracy.margin_m:.1f} m more away"
+            self._alerts.put("accuracy", text, now_us)
 
     def report_loss(self, now_us: int) -> None:
         """Report that the vehicle's estimator has lost its position, or has found it again."""

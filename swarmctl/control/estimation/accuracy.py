@@ -1,7 +1,9 @@
-"""Waits until an estimator's reported accuracy is meaningful: while a filter settles, its figure is not.
+"""What an estimator's reported accuracy says: before the start whether it has settled, in flight what it has lost.
 
-PX4 reports 14 m one second after boot, 0.01 m at two, and rises to 0.29 m by nine seconds, where it stays (measured,
-simulated GPS). The accuracy used is the largest figure of a window in which it has hardly changed.
+While a filter settles its figure means nothing. PX4 reports 14 m one second after boot, 0.01 m at two, and rises to 0.29 m by nine seconds, where it stays (measured,
+simulated GPS). The accuracy used is the largest figure of a window in which it has hardly changed. In flight a PX4
+whose GPS has failed goes on by its inertial sensors: 0.5 m after 1.5 s, 1 m after 3.5 s, and 2 m after 5.5 s, when its
+flags say that it has no position (measured).
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from collections import deque
 _WINDOW_US = 4_000_000
 _SETTLED_CHANGE_01 = 0.25  # largest relative change within a window; a change of satellites alone is less
 _SETTLED_CHANGE_M = 0.02
+_SIGMAS = 2.0  # by how many standard deviations a vehicle may be away from where it is estimated
 _NO_CLAIM_TIMEOUT_US = 3_000_000  # a vehicle that reports its accuracy at all has done so by then
 
 
@@ -50,3 +53,29 @@ class AccuracyMonitor:
             )
             return f"the estimator's accuracy to settle, within {steady} (now {claims_m[-1]:.2f} m)"
         return ""
+
+
+class AccuracyMargin:
+    """Computes the margin [m] for an estimate that has become less accurate than it was when its vehicle started.
+
+    The accuracy at the start is part of the separation; what settling allows for is no loss.
+
+    Attributes:
+        margin_m: distance by which the vehicle may be farther from its estimate than the separation allows for.
+    """
+
+    def __init__(self) -> None:
+        self.margin_m = 0.0
+        self._start_m: float | None = None
+
+    def update(self, accuracy_m: float | None, *, is_standing: bool) -> None:
+        """Update with the newest reported accuracy, 1-sigma [m], of a vehicle that stands before its flight or flies.
+
+        An agent that is started in flight takes the first figure it hears for that of the start.
+        """
+        if accuracy_m is None:
+            return
+        if is_standing or self._start_m is None:
+            self._start_m = accuracy_m
+        settled_m = self._start_m * (1.0 + _SETTLED_CHANGE_01) + _SETTLED_CHANGE_M
+        self.margin_m = _SIGMAS * max(0.0, accuracy_m - settled_m)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarmctl.control.estimation.accuracy import AccuracyMonitor
+from swarmctl.control.estimation.accuracy import AccuracyMargin, AccuracyMonitor
 
 SECOND = 1_000_000
 PX4_AFTER_BOOT_S, PX4_CLAIM_M = [1.2, 2.2, 4.2, 9.0, 30.0], [14.1, 0.010, 0.073, 0.285, 0.290]
@@ -51,3 +51,23 @@ def test_a_vehicle_that_reports_no_accuracy_is_waited_for_briefly() -> None:
     assert "tell" in fed([None]).unsettled(1 * SECOND)
     silent = fed([None] * 4)
     assert (silent.unsettled(4 * SECOND), silent.worst_m) == ("", None)
+
+
+def test_what_an_accuracy_loses_in_flight_becomes_a_margin() -> None:
+    margin = AccuracyMargin()
+    margin.update(None, is_standing=True)
+    for claim_m in (14.1, 0.2, 0.3):  # of an estimator that settles; the newest counts
+        margin.update(claim_m, is_standing=True)
+        assert margin.margin_m == 0.0
+    for claim_m, margin_m in ((0.39, 0.0), (0.7, 0.61), (2.07, 3.35), (0.3, 0.0)):
+        margin.update(claim_m, is_standing=False)
+        assert abs(margin.margin_m - margin_m) < 1e-9
+    margin.update(None, is_standing=False)
+    assert margin.margin_m == 0.0
+
+
+def test_an_agent_that_starts_in_flight_takes_the_accuracy_it_finds() -> None:
+    margin = AccuracyMargin()
+    for claim_m, margin_m in ((1.0, 0.0), (2.0, 1.46)):
+        margin.update(claim_m, is_standing=False)
+        assert abs(margin.margin_m - margin_m) < 1e-9

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.phases.inputs import PeerInputs
-from swarmctl.core.types import Command, FlightMode, Phase, Verb
+from swarmctl.core.types import Command, FlightMode, Mode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, SECOND, START, UTC0_US, Flight, ready
 
 # -- transit to the start ---------------------------------------------------------------------------------------------
@@ -201,6 +201,17 @@ def test_ready_means_at_the_start_and_at_rest() -> None:
     ready_us = flight.utc_us
     flight.run(0.1)
     assert (flight.phase, flight.mission.ready_utc_us) == (Phase.READY, ready_us)
+
+
+def test_nobody_is_ready_where_no_position_is_known() -> None:
+    flight = Flight().until(Phase.GOTO_START)
+    flight.flight_mode, flight.pos = FlightMode.EXTERNAL, START.copy()
+    flight.failsafe_mode = Mode.STATE_STALE
+    flight.run(2.0)
+    assert flight.at == "GOTO_START"
+    flight.failsafe_mode = Mode.TRACKING
+    flight.run(0.1)
+    assert flight.at == "READY"
 
 
 # -- the common beginning ---------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from swarmctl.control.phases import handover
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.mission_state import SPIN_UP_US, MissionState
 from swarmctl.control.phases.trajectories import is_at
-from swarmctl.core.types import Command, FlightMode, Landed, Phase, VehicleState, Verb
+from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
 
 def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
@@ -50,7 +50,9 @@ def goto_start(mission: MissionState, inputs: PhaseInputs, state: VehicleState) 
         return []
     if mission.climb.cut_short:
         _finish_climb(mission, inputs.now_us, state)
-    elif is_at(state, mission.start_ned_m, mission.params.arrive_m, mission.params.arrive_m_s):
+    elif inputs.mode is not Mode.STATE_STALE and is_at(
+        state, mission.start_ned_m, mission.params.arrive_m, mission.params.arrive_m_s
+    ):
         mission.ready_utc_us = inputs.utc_us
         mission.enter(Phase.READY, inputs.now_us)
     return []
