@@ -267,6 +267,7 @@ class Agent:
             planning,
             disturbance_ned_m_s2=disturbance_ned_m_s2,
             battery_01=self._ports.autopilot.health.battery_01,
+            dead_reckoning_s=self._vehicle_watch.accuracy.dead_reckoning_s,
         )
         flown = self._modes.flown(state, planning, disturbance_ned_m_s2)
         self._controller_watch.count(self._mission.phase, plan, flown)

@@ -251,4 +251,5 @@ class Health:
     had_control: bool  # the autopilot follows setpoints and has not been released
     battery_01: float  # charge that remains; negative: unknown
     link_lost_01: float  # share of the newest seconds in which the state was stale
+    dead_reckoning_s: float = 0.0  # for how long the estimate has been going on without GPS
     pilot_override: bool  # a pilot or the autopilot timing over, until an operator resumes

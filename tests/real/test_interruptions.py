@@ -108,6 +108,19 @@ def test_who_only_warns_of_its_battery_flies_on(field: Fielder) -> None:
     here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
 
 
+def test_peers_keep_away_from_who_has_lost_its_position(field: Fielder) -> None:
+    here = field(PX4, 3)
+    launched = here.launch(PX4_CONFIG)
+    launched.until_phase("TRACK", 3)
+    time.sleep(5.0)
+    no_satellites = (b"SIM_GPS_USED", 0.0, mav.MAV_PARAM_TYPE_INT32)
+    here.witness.say(1, mav.MAVLink_param_set_message(2, 1, *no_satellites))
+    assert launched.end(END_S) == EXIT_MISSION, launched.text()
+    assert launched.events("position_lost", "agent-1"), "its estimator has said so"
+    here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
+    assert here.witness.min_separation_m() > BODIES_M
+
+
 def test_who_has_lost_its_position_is_landed_by_its_autopilot(field: Fielder) -> None:
     here = field(PX4, 1)
     launched = here.launch(PX4_CONFIG, *LONE_PX4)

@@ -34,7 +34,7 @@ class ModeSelector:
 
     Attributes:
         decision: of the newest tick.
-        escalation: response to what wears out: battery, link.
+        escalation: response to what wears out: battery, link, positions.
     """
 
     def __init__(
@@ -77,6 +77,7 @@ class ModeSelector:
         *,
         disturbance_ned_m_s2: Array,
         battery_01: float | None,
+        dead_reckoning_s: float,
     ) -> None:
         """Decide the mode of a tick from its state and plan.
 
@@ -86,6 +87,7 @@ class ModeSelector:
             planning: what was planned from it.
             disturbance_ned_m_s2: (3,) estimate.
             battery_01: newest report of the charge; None if the vehicle does not know it.
+            dead_reckoning_s: for how long its estimate has been going on without GPS.
         """
         plan, start = planning.plan, planning.start
         if plan is None or plan.status is PlanStatus.OK:
@@ -95,7 +97,7 @@ class ModeSelector:
             self._plan_buffer.take(plan, start, planning.keep_outs, brakes)
         is_stale = state is not None and not self.is_fresh(now_us, state)
         self._endurance.update(now_us, battery_01, is_stale)
-        health = self._health(now_us, state, plan)
+        health = self._health(now_us, state, plan, dead_reckoning_s)
         self.decision = decide(health, self._params)
         self._report(now_us, escalate(health, self._params))
 
@@ -116,7 +118,7 @@ class ModeSelector:
             return self._brake_and_hold(planning.start, disturbance_ned_m_s2)
         return None
 
-    def _health(self, now_us: int, state: VehicleState | None, plan: Plan | None) -> Health:
+    def _health(self, now_us: int, state: VehicleState | None, plan: Plan | None, dead_reckoning_s: float) -> Health:
         good = self._plan_buffer.plan
         return Health(
             state_age_us=_NO_TIME_US if state is None else max(0, now_us - state.t_us),
@@ -132,6 +134,7 @@ class ModeSelector:
             had_control=self._mission.had_control,
             battery_01=self._endurance.battery_01,
             link_lost_01=self._endurance.link_lost_01,
+            dead_reckoning_s=dead_reckoning_s,
             pilot_override=self._mission.pilot_override,
         )
 

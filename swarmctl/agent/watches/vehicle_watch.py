@@ -68,8 +68,8 @@ class VehicleWatch:
 
     def report_accuracy(self, now_us: int, *, is_standing: bool) -> None:
         """Report that the vehicle's estimate has become inaccurate in flight, while it is."""
-        accuracy_m = self._ports.autopilot.pos_accuracy_m
-        self.accuracy.update(accuracy_m, is_standing=is_standing)
+        accuracy_m, missing_s = self._ports.autopilot.pos_accuracy_m, self._ports.autopilot.health.fix_missing_s
+        self.accuracy.update(now_us, accuracy_m, is_standing=is_standing, fix_missing_s=missing_s)
         if accuracy_m is not None and self.accuracy.margin_m:
             text = f"estimate is {accuracy_m:.1f} m off (rms): peers keep {self.accuracy.margin_m:.1f} m more away"
             self._alerts.put("accuracy", text, now_us)

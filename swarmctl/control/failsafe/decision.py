@@ -35,6 +35,8 @@ class FailsafeParams(Params):
     link_warn_01: float = Field(0.2, ge=0, le=1)  # an alert while its state is stale for more of the time
     link_rtl_01: float = Field(1.0, ge=0, le=1)  # back to the start; 1, as in the next one: never
     link_land_01: float = Field(1.0, ge=0, le=1)  # landing in place
+    dead_reckoning_warn_s: float = Field(0.5, ge=0, le=60)  # an alert this long after the newest fix of GPS; 60: never
+    dead_reckoning_land_s: float = Field(1.5, ge=0, le=60)  # landing in place, before the autopilot lands it blindly
     window_s: float = Field(5.0, gt=0, le=60)  # charge counts as its highest in this time, the link as its share of it
 
     def problems(self) -> Iterator[str]:
@@ -43,14 +45,15 @@ class FailsafeParams(Params):
             limits = watched.limits(self)
             order = [watched.sign * limit for limit in limits if limit != watched.never]
             if order != sorted(order):
-                keys = ", ".join(f"{watched.name}_{response.name.lower()}_01" for response in _ESCALATION)
-                yield f"agent.failsafe: {keys} = {list(limits)}: do not escalate; put them in this order of severity"
+                keys = watched.keys
+                given = [getattr(self, key) for key in keys]
+                yield f"agent.failsafe: {', '.join(keys)} = {given}: do not escalate; order them by severity"
 
     def acts(self, name: str) -> list[str]:
         """Return in words what the agent does, and from where on, as far as what is called `name` wears out."""
-        (watched,) = (row for row in _WATCHED if row.name == name)
-        limits = zip(_ESCALATION, watched.limits(self), strict=True)
-        return [f"{_SAID[response]} at {limit:.0%}" for response, limit in limits if limit != watched.never]
+        (row,) = (each for each in _WATCHED if each.name == name)
+        limits = zip(_ESCALATION, row.limits(self), strict=True)
+        return [f"{_SAID[response]} at {row.shown(limit)}" for response, limit in limits if limit != row.never]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,14 +89,23 @@ class _Watched:
     """A row of the table of escalation: what is measured, and from where on it asks for each response."""
 
     name: str
-    measure: Callable[[Health], float]  # 0..1, negative if unknown
+    measure: Callable[[Health], float]  # negative if unknown
     limits: Callable[[FailsafeParams], tuple[float, float, float]]  # of WARN, RTL and LAND
     sign: float  # 1 where more is worse, -1 where less is
     never: float  # limit that switches a response off
-    said: str  # with {} for the percentage
+    said: str  # with {} for its value
+    unit: str = "01"  # of its keys
+    shown: Callable[[float], str] = "{:.0%}".format
+
+    @property
+    def keys(self) -> list[str]:
+        """Return the names of its limits, which need not be of all responses."""
+        names = [f"{self.name}_{response.name.lower()}_{self.unit}" for response in _ESCALATION]
+        return [name for name in names if name in FailsafeParams.model_fields]
 
 
 _SAID = {Response.WARN: "warns", Response.RTL: "returns", Response.LAND: "lands"}
+_NEVER_S = 60.0
 _ESCALATION = (Response.WARN, Response.RTL, Response.LAND)
 _WATCHED = (
     _Watched(
@@ -102,7 +114,7 @@ _WATCHED = (
         limits=lambda p: (p.battery_warn_01, p.battery_rtl_01, p.battery_land_01),
         sign=-1.0,
         never=0.0,
-        said="battery at {} %",
+        said="battery at {}",
     ),
     _Watched(
         name="link",
@@ -110,7 +122,17 @@ _WATCHED = (
         limits=lambda p: (p.link_warn_01, p.link_rtl_01, p.link_land_01),
         sign=1.0,
         never=1.0,
-        said="no state of the vehicle in {} % of the time",
+        said="no state of the vehicle in {} of the time",
+    ),
+    _Watched(
+        name="dead_reckoning",
+        measure=lambda health: health.dead_reckoning_s,
+        limits=lambda p: (p.dead_reckoning_warn_s, _NEVER_S, p.dead_reckoning_land_s),
+        sign=1.0,
+        never=_NEVER_S,
+        said="no GPS for {}, and an estimate that gets worse",
+        unit="s",
+        shown="{:.1f} s".format,
     ),
 )
 
@@ -123,8 +145,9 @@ def escalate(health: Health, params: FailsafeParams) -> Escalation:
         if value < 0.0:
             continue
         for response, limit in zip(_ESCALATION, watched.limits(params), strict=True):
-            if watched.sign * (value - limit) > 0.0 and response > found.response:
-                found = Escalation(response, watched.said.format(round(100.0 * value)))
+            due = limit != watched.never and watched.sign * (value - limit) > 0.0
+            if due and response > found.response:
+                found = Escalation(response, watched.said.format(watched.shown(value)))
     return found
 
 

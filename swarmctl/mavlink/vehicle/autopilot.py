@@ -292,7 +292,7 @@ class Autopilot:
 
     def _gps(self, message: Any, arrived_us: int) -> None:
         self._accuracy("GPS_RAW_INT", message.h_acc * 1e-3)
-        self.health.gps(message)
+        self.health.gps(message, arrived_us)
 
     def _accuracy(self, source: str, sigma_m: float) -> None:
         """Return an accuracy [m], or None for 0, which both messages use for unknown."""
