@@ -35,7 +35,7 @@ def sys_status(r: Report) -> Fields:
     health = _SENSORS_HEALTHY
     if pilot.armed or pilot.armable(r.estimate.t_us):
         health |= _PREARM_CHECK
-    if not pilot.has_position:
+    if not (pilot.has_position and r.estimate.gps_ok):
         health &= ~_SENSOR_GPS
     if pilot.battery_01 <= pilot.parameters.real("BAT_CRIT_THR"):
         health &= ~_SENSOR_BATTERY
@@ -66,7 +66,7 @@ def battery_status(r: Report) -> Fields:
 
 def gps_raw(r: Report) -> Fields:
     e, origin = r.estimate, r.origin
-    if not r.autopilot.has_position:
+    if not (r.autopilot.has_position and e.gps_ok):
         return e.t_us, 0, 0, 0, 9999, 9999, 0, 65535, 0, 0, 0, 0, 0, 0, 0, 0
     lat_e7, lon_e7 = origin.to_geo_e7(e.pos_ned_m[0], e.pos_ned_m[1])
     alt_mm = int32(origin.alt_mm - e.pos_ned_m[2] * 1e3)

@@ -73,12 +73,16 @@ class Response(enum.IntEnum):
     LAND = 3
 
 
+_ANY_US = 1 << 62
+
+
 @dataclass(frozen=True, slots=True)
 class Escalation:
-    """The response to what wears out, and the reason for it."""
+    """The response to what wears out, the reason for it, and after how long a landing no longer waits for room."""
 
     response: Response
     reason: str
+    patience_us: int = _ANY_US
 
 
 NOTHING_WORN = Escalation(Response.NONE, "")
@@ -96,6 +100,7 @@ class _Watched:
     said: str  # with {} for its value
     unit: str = "01"  # of its keys
     shown: Callable[[float], str] = "{:.0%}".format
+    patience_us: int = _ANY_US
 
     @property
     def keys(self) -> list[str]:
@@ -130,9 +135,10 @@ _WATCHED = (
         limits=lambda p: (p.dead_reckoning_warn_s, _NEVER_S, p.dead_reckoning_land_s),
         sign=1.0,
         never=_NEVER_S,
-        said="no GPS for {}, and an estimate that gets worse",
+        said="no GPS for {} s, and an estimate that gets worse",
         unit="s",
-        shown="{:.1f} s".format,
+        shown="{:.1f}".format,
+        patience_us=2_000_000,  # to brake; room can't be made by positions that get worse
     ),
 )
 
@@ -147,7 +153,7 @@ def escalate(health: Health, params: FailsafeParams) -> Escalation:
         for response, limit in zip(_ESCALATION, watched.limits(params), strict=True):
             due = limit != watched.never and watched.sign * (value - limit) > 0.0
             if due and response > found.response:
-                found = Escalation(response, watched.said.format(watched.shown(value)))
+                found = Escalation(response, watched.said.format(watched.shown(value)), watched.patience_us)
     return found
 
 

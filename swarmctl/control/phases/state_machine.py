@@ -154,6 +154,7 @@ class MissionStateMachine:
             mission.go_home(inputs.now_us, state)
         elif (response >= Response.RTL and mission.may_fly_on) or (response is Response.LAND and flies_home):
             mission.give_up(why, inputs, state)
+            mission.land_by_us = min(mission.land_by_us, inputs.now_us + inputs.escalation.patience_us)
 
     def _pause(self, inputs: PhaseInputs, state: VehicleState) -> None:
         """Come to rest while the bus is lost, because peers then assume braking, and while deadlines are missed."""

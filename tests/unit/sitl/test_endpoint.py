@@ -137,7 +137,10 @@ def test_a_lost_position_goes_on_and_its_flags_say_so() -> None:
     client = Client(run_s=0.004)
     client.run(1.0)
     client.world.estimator.lose_gps(0)
-    late = client.run(7.0)[-200:]
+    assert of("GPS_RAW_INT", client.run(1.1))[-1].fix_type == 0, "at once"
+    early = of("ESTIMATOR_STATUS", client.run(1.1))[-1]
+    assert early.flags & 0x18
+    late = client.run(5.0)[-200:]
     assert of("ODOMETRY", late)
     assert not of("ESTIMATOR_STATUS", client.run(1.1))[-1].flags & 0x18
 
