@@ -30,6 +30,7 @@ from swarmctl.files import replaced
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.ops.vehicles.vehicle_links import open_links
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.telemetry.recording.run_folder import refuse_as_output
 
 if TYPE_CHECKING:
     from swarmctl.check.ground_services import GroundVehicle
@@ -61,11 +62,12 @@ def bundle(options: BundleOptions) -> Bundle:
     """Write the archive. What can't be had from a vehicle is named in `vehicles.json`.
 
     Raises:
-        ConfigError: it is no run folder.
+        ConfigError: it is no run folder, or the archive is a file that the run has recorded.
         StartError: the archive can't be written.
     """
     config, folder = load_recorded(options.folder), options.folder.resolve()
     output = options.output or folder.with_name(f"{folder.name}.zip")
+    refuse_as_output(output, folder, ".zip")
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)
     try:
         with ended_cleanly, tempfile.TemporaryDirectory(prefix="swarm-bundle-") as scratch:

@@ -10,19 +10,20 @@ from swarmctl.configuration.view import viewed_flight
 from swarmctl.errors import StartError
 from swarmctl.telemetry.export.mcap import RecordedFlight, write_mcap
 from swarmctl.telemetry.recording.run_files import read_plans
-from swarmctl.telemetry.recording.run_folder import read_judged
+from swarmctl.telemetry.recording.run_folder import read_judged, refuse_as_output
 
 
 def export_mcap(directory: Path, output: Path | None) -> Path:
     """Write a finished run as MCAP, by default beside its folder, and return the file.
 
     Raises:
-        ConfigError: it is no folder of a finished run.
+        ConfigError: it is no folder of a finished run, or the file is one that the run has recorded.
         StartError: the library for it is not installed, or the file can't be written.
     """
     config = load_recorded(directory)
     judged = read_judged(directory, config.rules())
     path = output or directory.resolve().with_name(f"{directory.resolve().name}.mcap")
+    refuse_as_output(path, directory, ".mcap")
     recorded = RecordedFlight(
         run=judged.run,
         plans={agent: read_plans(directory, agent) for agent in judged.run.ticks},

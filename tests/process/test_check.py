@@ -313,8 +313,10 @@ def test_a_json_file_that_can_not_be_written_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "one.toml"
     url = f"udpin://127.0.0.1:{free_ports(1)[0]}"
     path.write_text(f'[swarm]\nagents=1\n[sitl]\nenabled=false\n[[vehicles]]\nsysid=1\nurl="{url}"\n')
+    with pytest.raises(StartError, match="is no folder"):  # before any vehicle is asked
+        check(load(path), CheckOptions(json=tmp_path / "nowhere" / "check.json", connect_s=1e6))
     with pytest.raises(StartError, match="can't be written"):
-        check(load(path), CheckOptions(json=tmp_path / "nowhere" / "check.json", connect_s=0.1))
+        check(load(path), CheckOptions(json=tmp_path, connect_s=0.1))
 
 
 def test_a_vehicle_is_given_a_key_and_from_then_on_checked_and_set_over_signed_frames_alone(

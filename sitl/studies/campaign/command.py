@@ -38,6 +38,10 @@ from sitl.studies.campaign.worker_pool import fly_trial, on_cluster, on_this_mac
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, exit_code_of
 
 MAX_AGENTS = 100
+_AXES = (  # options that --quick has its own values of
+    *("scenario", "agents", "delay", "loss", "noise", "wind", "protections"),
+    *("airframe", "disturbance", "sets", "trials", "first_seed"),
+)
 _Value = TypeVar("_Value")
 
 
@@ -75,6 +79,10 @@ def _trials(options: argparse.Namespace) -> list[Trial]:
         ConfigError: with every cell that can't be flown, and why.
     """
     if options.quick:
+        usual = vars(_parser().parse_args([]))
+        given = [name for name in _AXES if vars(options)[name] != usual[name]]
+        if given:
+            raise ConfigError("--quick", [f"{name}: leave it out, what is flown is fixed" for name in given])
         return list(QUICK)
     found: list[Cell] = []
     for name in options.scenario:

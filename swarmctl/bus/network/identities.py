@@ -79,6 +79,8 @@ def revoke_identity(folder: Path, name: str) -> Path:
     """
     if name == AUTHORITY or Path(name).name != name:
         raise ConfigError("keys revoke", [f"{name!r}: name one of [[hosts]], or station"])
+    if not (folder / certificate_file(name)).exists():
+        raise ConfigError("keys revoke", [f"{name!r}: has no identity in {folder}; there are: {_named(folder)}"])
     with _reported("keys revoke", folder):
         authority, key = _authority(folder)
         revoked = revoked_serials(folder, authority) | {read_certificate(folder, name).serial_number}
@@ -108,6 +110,12 @@ def _reported(verb: str, folder: Path) -> Iterator[None]:
 def _make(folder: Path, name: str, signer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey], ip: _Ip | None) -> None:
     key = ec.generate_private_key(ec.SECP256R1())
     _write(folder, name, _signed(name, key.public_key(), signer, ip), key)
+
+
+def _named(folder: Path) -> str:
+    """Return the names of the identities in a folder."""
+    names = sorted(key_file.stem for key_file in folder.glob("*.key") if key_file.stem != AUTHORITY)
+    return ", ".join(names) or "none"
 
 
 def _remove(folder: Path, name: str) -> None:

@@ -52,6 +52,8 @@ def check(config: Config, options: CheckOptions) -> int:
     Raises:
         StartError: the built-in simulator does not come up, or the JSON file can't be written.
     """
+    if options.json is not None and not options.json.parent.is_dir():  # told before every vehicle is asked
+        raise StartError(f"{options.json}: {options.json.parent} is no folder. Choose another with --json")
     for line in warning_lines(config):
         print(line, file=sys.stderr)
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)  # so that started processes are ended

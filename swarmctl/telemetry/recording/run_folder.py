@@ -152,6 +152,17 @@ def report_run(directory: Path, rules: Rules) -> Path:
         raise StartError(f"{directory / REPORT}: can't be written: {error.strerror or error}") from error
 
 
+def refuse_as_output(output: Path, directory: Path, suffix: str) -> None:
+    """Refuse to write over what a run has recorded: an existing file of its folder without the output's own suffix.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    inside = directory.resolve() in output.resolve().parents
+    if inside and output.exists() and output.suffix != suffix:
+        raise ConfigError("--output", [f"{output}: is a file of the run; choose one that ends with {suffix}"])
+
+
 def _refuse_recorded(directory: Path) -> None:
     """Check that nobody writes to the raw files of an unfinished run, which are packed and removed when it is finished.
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from swarmctl.bus.network.identities import make_identities, revoke_identity
+from swarmctl.errors import ConfigError
 from swarmctl.mavlink.signing.key_file import read_key
 from swarmctl.ops import cli
 
@@ -65,3 +67,9 @@ def test_installing_without_keys_vehicles_or_a_readable_old_key_is_refused(
     config.write_text(VEHICLE + '[mavlink]\nsigning_keys = ["0.key"]\n')
     assert run("keys", "install", str(config)) == 2
     assert "has mode 0644" in capsys.readouterr().err
+
+
+def test_an_identity_that_is_not_there_is_not_revoked(tmp_path: Path) -> None:
+    make_identities(tmp_path / "identities", {"alpha": None, "station": None})
+    with pytest.raises(ConfigError, match=r"'bravo': has no identity in .*; there are: alpha, station"):
+        revoke_identity(tmp_path / "identities", "bravo")

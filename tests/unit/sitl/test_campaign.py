@@ -219,6 +219,7 @@ def test_no_cluster_is_refused_in_words() -> None:
         (["--set", "separation.radious_m=1"], "did you mean 'radius_m'"),
         (["--agents", "1"], "needs at least 2"),
         (["--scenario", "maze", "--agents", "60"], "would wait"),
+        (["--quick", "--scenario", "maze"], "scenario: leave it out"),
     ],
 )
 def test_cells_that_cannot_be_flown_are_refused_first(

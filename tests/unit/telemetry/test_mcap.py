@@ -23,6 +23,7 @@ from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.ops.bundle import BundleOptions, bundle
 from swarmctl.ops.export import export_mcap
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
@@ -48,6 +49,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def path(folder: Path) -> Path:
     return export_mcap(folder, None)
+
+
+def test_a_file_of_the_run_is_not_written_over(folder: Path) -> None:
+    before = (folder / "config.toml").read_bytes()
+    with pytest.raises(ConfigError, match="is a file of the run"):
+        export_mcap(folder, folder / "config.toml")
+    with pytest.raises(ConfigError, match="is a file of the run"):
+        bundle(BundleOptions(folder=folder, output=folder / "config.toml"))
+    assert (folder / "config.toml").read_bytes() == before
 
 
 def messages(path: Path, topic: str) -> list[tuple[int, Any]]:
