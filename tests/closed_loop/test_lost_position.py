@@ -21,6 +21,10 @@ BESIDE = (
     "mission.duration_s=15",
     "start.positions_ned_m=[[0,0,-2],[-1.2,0,-2]]",
 )
+ARDUCOPTER = (
+    "sitl.autopilot_kind=arducopter",
+    "agent.autopilot_params={GUID_OPTIONS=8, FS_GCS_ENABLE=5, FS_GCS_TIMEOUT=2.0, ATC_ANGLE_BOOST=0}",
+)
 SEPARATION_M = 0.85
 ENDED_S = 40.0  # start 14 s, loss 3 s, braking 4 s, landing 9 s; waiting for room lasts 20 s
 
@@ -58,8 +62,9 @@ def test_negative_control_a_lost_position_that_is_believed_is_followed(
     assert strayed_m(flight) > 5 * LANDED_M
 
 
-def test_who_has_lost_gps_lands_while_it_still_knows_where_it_is(fly: Fly) -> None:
-    flight = fly_without_gps(fly)
+@pytest.mark.parametrize("kind", [(), ARDUCOPTER], ids=["px4", "arducopter"])
+def test_who_has_lost_gps_lands_while_it_still_knows_where_it_is(fly: Fly, kind: Sequence[str]) -> None:
+    flight = fly_without_gps(fly, (*ALONE, *kind))
     assert all(outcome.startswith("no GPS for") for outcome in flight.outcomes)
     assert not flight.lockstep.world.truth_rows()["armed"].any()
     assert strayed_m(flight) < LANDED_M
@@ -71,7 +76,7 @@ def separation_aloft_m(flight: Flight) -> float:
     return float(np.linalg.norm(np.diff(flight.pos_ned_m[aloft, :2], axis=1), axis=2).min())
 
 
-@pytest.mark.parametrize("landing", [(), NOT_LANDED], ids=["lands", "goes-on"])
+@pytest.mark.parametrize("landing", [(), NOT_LANDED, ARDUCOPTER], ids=["lands", "goes-on", "arducopter"])
 def test_peers_keep_away_from_who_drifts(fly: Fly, landing: Sequence[str]) -> None:
     flight = fly_without_gps(fly, (*BESIDE, *landing))
     assert separation_aloft_m(flight) >= SEPARATION_M

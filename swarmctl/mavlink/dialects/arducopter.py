@@ -124,7 +124,7 @@ ARDUCOPTER = Dialect(
         SYS_STATUS: 5.0,
         EXTENDED_SYS_STATE: 10.0,
         ATTITUDE_TARGET: 5.0,
-        GPS_RAW_INT: 1.0,
+        GPS_RAW_INT: 5.0,  # a missing fix is seen by it first: its EKF lands 8 s later
         GLOBAL_POSITION_INT: 2.0,
     },
     rules=(
