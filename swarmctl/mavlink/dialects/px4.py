@@ -133,7 +133,7 @@ PX4 = Dialect(
         ATTITUDE_TARGET: 5.0,
         EXTENDED_SYS_STATE: 10.0,
         CURRENT_MODE: 50.0,  # interval at which PX4 looks for a change; it is sent at 2 Hz and on change
-        ESTIMATOR_STATUS: 2.0,  # flags and accuracy: by them a lost position is seen
+        ESTIMATOR_STATUS: 1.0,  # flags and accuracy: by them a lost position is seen
         ATTITUDE: 2.0,  # these four default to 50 to 100 Hz, half of all decoded frames, and are not used
         ATTITUDE_QUATERNION: 2.0,
         HIGHRES_IMU: 2.0,
