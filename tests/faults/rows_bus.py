@@ -65,7 +65,7 @@ ROWS = (
         reacts=refused("malformed", 20),
         lasts_s=4.0,
         told=(r"agent-1 were refused \(path malformed \d+\)",),
-        finally_={"they don't pass": lambda scene: scene.moved_m(0) > 1.0},
+        finally_={"they don't pass": lambda scene: scene.speed_m_s(0) > 0.2},
         off=Off(patches=((peers, "decode_path", lambda payload: unchecked(payload)),)),
     ),
     SimulatedRow(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
@@ -91,12 +90,6 @@ class Scene:
 
     def speed_m_s(self, i: int) -> float:
         return float(np.linalg.norm(self.true(i)["vel_ned_m_s"]))
-
-    def moved_m(self, i: int) -> float:
-        """How far a vehicle is from where it was at the event."""
-        truth = self.lockstep.truth.reshape(-1, len(self.agents))
-        begin = int(np.searchsorted(truth["t_us"][:, i], self.began_us or 0))
-        return math.dist(truth["pos_ned_m"][begin, i], self.true(i)["pos_ned_m"])
 
     def flight_mode(self, i: int) -> FlightMode:
         return FlightMode(int(self.true(i)["flight_mode"]))
