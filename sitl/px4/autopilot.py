@@ -63,6 +63,7 @@ class Autopilot:
         released: an air start's clamp has been opened.
         texts: (severity, text) not yet sent.
         reboot_at_us: time of a pending reboot, or None.
+        unaided_us: time since the newest position by GPS.
         position_ok: input; there is a horizontal position.
         battery_01, battery_v, battery_a: input; charge, voltage, current (-1: not measured).
         boot_utc_us: UTC of its boot.

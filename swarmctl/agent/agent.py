@@ -292,13 +292,13 @@ class Agent:
 
     def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
         """Publish the predicted path, and what the separation policy has to say."""
-        estimate_m = self._ports.autopilot.frame.margin_m + self._vehicle_watch.accuracy.margin_m
+        jump_m, accuracy_m = self._ports.autopilot.frame.margin_m, self._vehicle_watch.accuracy.margin_m
         self._path_publisher.publish(
             state,
             flown,
             self._publisher.seq,
             disturbance_ned_m_s2=self._own_state.estimate.disturbance_ned_m_s2,
-            margins_m=(estimate_m, self._deadlines.margin_m, self._planner.directive.margin_m),
+            margins_m=(jump_m, accuracy_m, self._deadlines.margin_m, self._planner.directive.margin_m),
         )
         self._separation.publish(self._ports.clock.utc_us())
         self._interest.update(state, self._ports.clock.utc_us())

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+GPS_FIX_3D = 3  # GPS_FIX_TYPE: this and more is a position
 MAX_MARGIN_M = 10.0  # limit of the margin in a path, so that one peer cannot ground all others
 Sampled = Callable[[Array], tuple[Array, Array]]  # offsets (K,) [s] from now -> positions, velocities, (K, 3) each
 
@@ -251,5 +252,5 @@ class Health:
     had_control: bool  # the autopilot follows setpoints and has not been released
     battery_01: float  # charge that remains; negative: unknown
     link_lost_01: float  # share of the newest seconds in which the state was stale
-    dead_reckoning_s: float = 0.0  # for how long the estimate has been going on without GPS
+    dead_reckoning_s: float  # for how long the estimate has been going on without GPS
     pilot_override: bool  # a pilot or the autopilot timing over, until an operator resumes

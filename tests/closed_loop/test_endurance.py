@@ -40,7 +40,7 @@ def low() -> Flight:
 def test_a_low_battery_brings_the_vehicle_back_under_its_own_plan(low: Flight) -> None:
     agent, peer = low.lockstep.agents
     assert agent is not None and peer is not None
-    assert agent.outcome == "battery at 15%: flew back"
+    assert agent.outcome == "battery at 15 %: flew back"
     assert peer.outcome == "completed"
     assert responses(low, 0)[:1] == ["RTL"]
     assert responses(low, 1) == []

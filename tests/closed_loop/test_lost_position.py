@@ -11,9 +11,13 @@ from sitl.lockstep import Lockstep
 from swarmctl.control.estimation import accuracy
 from swarmctl.mavlink.vehicle import autopilot
 from tests.closed_loop.conftest import Flight, Fly
+from tests.closed_loop.test_handover import COPTER
 
 AT_S = 3.0
-LANDED_M = 4.0  # from where it took off: lost 6 s, until the estimator has said so, and a blind descent
+LANDED_M = 4.0  # from where it took off: lost 6 s, until the estimator has said so twice, and a blind descent
+SEPARATION_M = 0.85
+ENDED_S = 40.0  # start 14 s, loss 3 s, braking 4 s, landing 9 s; waiting for room lasts 20 s
+ALONE = ("swarm.agents=1", "mission.kind=hover", "mission.duration_s=60")
 # It drifts towards the peer 1.2 m away, who gives way by what the estimator has told by then.
 BESIDE = (
     "swarm.agents=2",
@@ -21,21 +25,15 @@ BESIDE = (
     "mission.duration_s=15",
     "start.positions_ned_m=[[0,0,-2],[-1.2,0,-2]]",
 )
-ARDUCOPTER = (
-    "sitl.autopilot_kind=arducopter",
-    "agent.autopilot_params={GUID_OPTIONS=8, FS_GCS_ENABLE=5, FS_GCS_TIMEOUT=2.0, ATC_ANGLE_BOOST=0}",
-)
-SEPARATION_M = 0.85
-ENDED_S = 40.0  # start 14 s, loss 3 s, braking 4 s, landing 9 s; waiting for room lasts 20 s
-
-
 NOT_LANDED = ("agent.failsafe.dead_reckoning_land_s=60",)  # before its flags say that it has no position
-ALONE = ("swarm.agents=1", "mission.kind=hover", "mission.duration_s=60")
 
 
-def fly_without_gps(fly: Fly, scene: Sequence[str] = ALONE) -> Flight:
+def fly_without_gps(fly: Fly, scene: Sequence[str] = ALONE, lost: int = 1) -> Flight:
+    """Fly a scene in which so many vehicles, the first ones, lose GPS at once."""
+
     def lose(running: Lockstep) -> None:
-        running.world.estimator.lose_gps(0)
+        for vehicle in range(lost):
+            running.world.estimator.lose_gps(vehicle)
 
     return fly(*scene, at={AT_S: lose})
 
@@ -62,7 +60,7 @@ def test_negative_control_a_lost_position_that_is_believed_is_followed(
     assert strayed_m(flight) > 5 * LANDED_M
 
 
-@pytest.mark.parametrize("kind", [(), ARDUCOPTER], ids=["px4", "arducopter"])
+@pytest.mark.parametrize("kind", [(), COPTER], ids=["px4", "arducopter"])
 def test_who_has_lost_gps_lands_while_it_still_knows_where_it_is(fly: Fly, kind: Sequence[str]) -> None:
     flight = fly_without_gps(fly, (*ALONE, *kind))
     assert all(outcome.startswith("no GPS for") for outcome in flight.outcomes)
@@ -76,7 +74,7 @@ def separation_aloft_m(flight: Flight) -> float:
     return float(np.linalg.norm(np.diff(flight.pos_ned_m[aloft, :2], axis=1), axis=2).min())
 
 
-@pytest.mark.parametrize("landing", [(), NOT_LANDED, ARDUCOPTER], ids=["lands", "goes-on", "arducopter"])
+@pytest.mark.parametrize("landing", [(), NOT_LANDED, COPTER], ids=["lands", "goes-on", "arducopter"])
 def test_peers_keep_away_from_who_drifts(fly: Fly, landing: Sequence[str]) -> None:
     flight = fly_without_gps(fly, (*BESIDE, *landing))
     assert separation_aloft_m(flight) >= SEPARATION_M
@@ -91,11 +89,7 @@ def test_negative_control_who_drifts_comes_close_to_peers_that_are_not_told(
 
 
 def test_all_who_have_lost_gps_land_soon_though_none_finds_room(fly: Fly) -> None:
-    def lose(running: Lockstep) -> None:
-        for vehicle in range(3):
-            running.world.estimator.lose_gps(vehicle)
-
-    flight = fly("mission.duration_s=60", at={AT_S: lose})
+    flight = fly_without_gps(fly, ("mission.duration_s=60",), lost=3)
     assert all(outcome.startswith("no GPS for") for outcome in flight.outcomes)
     assert not flight.lockstep.world.truth_rows()["armed"].any()
     assert flight.t_s[-1] < ENDED_S

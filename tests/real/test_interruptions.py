@@ -108,15 +108,20 @@ def test_who_only_warns_of_its_battery_flies_on(field: Fielder) -> None:
     here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
 
 
+def lose_gps(here: Field, index: int) -> None:
+    """Take the satellites from one simulated receiver: the first parameter is of a PX4, the second of an ArduCopter."""
+    no_satellites = (b"SIM_GPS_USED", 0.0, mav.MAV_PARAM_TYPE_INT32)  # in any type zero is the same bits
+    here.witness.say(index, mav.MAVLink_param_set_message(index + 1, 1, *no_satellites))
+    here.witness.set_parameter(index, "SIM_GPS_DISABLE", 1.0)
+
+
 @pytest.mark.parametrize("kind", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
 def test_who_loses_gps_among_others_lands_and_they_keep_away(field: Fielder, kind: Kind) -> None:
     here = field(PX4, 3) if kind is PX4 else booted(field, 3)
     launched = here.launch(PX4_CONFIG if kind is PX4 else "tests/real/three_arducopters.toml")
     launched.until_phase("TRACK", 3)
     time.sleep(5.0)
-    no_satellites = (b"SIM_GPS_USED", 0.0, mav.MAV_PARAM_TYPE_INT32)  # in any type zero is the same bits
-    here.witness.say(1, mav.MAVLink_param_set_message(2, 1, *no_satellites))
-    here.witness.set_parameter(1, "SIM_GPS_DISABLE", 1.0)  # of an ArduCopter
+    lose_gps(here, 1)
     assert launched.end(END_S) == EXIT_MISSION, launched.text()
     assert "no GPS for" in launched.text()
     here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
@@ -128,8 +133,7 @@ def test_who_has_lost_its_position_is_landed_by_its_autopilot(field: Fielder) ->
     launched = here.launch(PX4_CONFIG, *LONE_PX4)
     launched.until_phase("TRACK", 1)
     time.sleep(5.0)
-    no_satellites = (b"SIM_GPS_USED", 0.0, mav.MAV_PARAM_TYPE_INT32)  # in any type zero is the same bits
-    here.witness.say(0, mav.MAVLink_param_set_message(1, 1, *no_satellites))
+    lose_gps(here, 0)
     assert launched.end(END_S) == EXIT_MISSION, launched.text()
     assert launched.events("position_lost", "agent-0"), "its estimator has said so"
     here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")

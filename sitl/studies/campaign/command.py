@@ -79,8 +79,8 @@ def _trials(options: argparse.Namespace) -> list[Trial]:
         ConfigError: with every cell that can't be flown, and why.
     """
     if options.quick:
-        usual = vars(_parser().parse_args([]))
-        given = [name for name in _AXES if vars(options)[name] != usual[name]]
+        usual = _parser()
+        given = [name for name in _AXES if getattr(options, name) != usual.get_default(name)]
         if given:
             raise ConfigError("--quick", [f"{name}: leave it out, what is flown is fixed" for name in given])
         return list(QUICK)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from swarmctl.agent.ports import Ports
 from swarmctl.agent.watches.alerts import Alerts
-from swarmctl.control.estimation.accuracy import AccuracyMargin
+from swarmctl.control.estimation.accuracy import AccuracyLoss
 from swarmctl.core.types import Verb
 from swarmctl.mavlink.commands import CommandResult
 
@@ -22,10 +22,10 @@ class VehicleWatch:
         accuracy: what the estimate has lost of its accuracy in flight.
     """
 
-    accuracy: AccuracyMargin
+    accuracy: AccuracyLoss
 
     def __init__(self, ports: Ports, alerts: Alerts) -> None:
-        self._ports, self._alerts, self.accuracy = ports, alerts, AccuracyMargin()
+        self._ports, self._alerts, self.accuracy = ports, alerts, AccuracyLoss()
         self._gaps = self._jumps = 0  # already reported
         self._is_lost = False  # as reported
         self._no_origin_us: int | None = None  # since when the vehicle does not tell its origin

@@ -114,7 +114,7 @@ def _make(folder: Path, name: str, signer: tuple[x509.Certificate, ec.EllipticCu
 
 def _named(folder: Path) -> str:
     """Return the names of the identities in a folder."""
-    names = sorted(key_file.stem for key_file in folder.glob("*.key") if key_file.stem != AUTHORITY)
+    names = sorted(file.stem for file in folder.glob(key_file("*")) if file.stem != AUTHORITY)
     return ", ".join(names) or "none"
 
 

@@ -7,7 +7,7 @@ import math
 from swarmctl.check.finding import Finding, line_of
 from swarmctl.check.scan.link_facts import VehicleFacts
 from swarmctl.config import Config
-from swarmctl.core.types import FlightMode
+from swarmctl.core.types import GPS_FIX_3D, FlightMode
 from swarmctl.core.verdict import Verdict
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
@@ -33,7 +33,6 @@ _SENSOR_BITS = {
 _PREARM = 1 << 28
 _ESTIMATES = {0: "attitude", 1: "horizontal velocity", 2: "vertical velocity", 4: "horizontal position", 5: "height"}
 _ESTIMATOR_FAULTS = {10: "GPS glitch", 11: "bad accelerometer"}  # bits of ESTIMATOR_STATUS.flags
-_FIX_3D = 3
 _BATTERY_LOW_01, _BATTERY_EMPTY_01 = 0.5, 0.25
 _ORIGIN_FAR_M = 1000.0  # local frames are rotated against each other, and the earth is curved
 
@@ -102,7 +101,7 @@ def estimator(facts: VehicleFacts, config: Config) -> Finding:
             return line(FIX, f"no {', '.join(missing)}", "wait for the estimator, or give it a position source", 74)
         if faults:
             return line(FIX, ", ".join(faults), "the estimator distrusts a sensor: find the cause before flight", 73)
-    elif gps is not None and gps.fix_type < _FIX_3D:
+    elif gps is not None and gps.fix_type < GPS_FIX_3D:
         return line(FIX, found, "no position: wait for a 3-D fix, or feed another position source", 74)
     if accuracy_m is None:
         return line(NOTE, found, "it does not tell how accurate it is; the separation radius has to allow for it")

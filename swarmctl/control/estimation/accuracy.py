@@ -58,8 +58,8 @@ class AccuracyMonitor:
         return ""
 
 
-class AccuracyMargin:
-    """Computes the margin [m] for an estimate that has become less accurate than it was when its vehicle started.
+class AccuracyLoss:
+    """Judges what an estimate has lost of the accuracy that it had when its vehicle started.
 
     The accuracy at the start is part of the separation; what settling allows for is no loss.
 

@@ -21,6 +21,9 @@ from pydantic import Field
 from swarmctl.core.params import Params
 from swarmctl.core.types import FlightMode, Health, Mode, Phase, PlanStatus
 
+_NEVER_S = 60.0  # long after any autopilot has landed by itself
+_ANY_US = 1 << 62  # of patience: a landing waits for room as long as it may
+
 
 class FailsafeParams(Params):
     """Time limits and thresholds of the failsafe."""
@@ -35,8 +38,8 @@ class FailsafeParams(Params):
     link_warn_01: float = Field(0.2, ge=0, le=1)  # an alert while its state is stale for more of the time
     link_rtl_01: float = Field(1.0, ge=0, le=1)  # back to the start; 1, as in the next one: never
     link_land_01: float = Field(1.0, ge=0, le=1)  # landing in place
-    dead_reckoning_warn_s: float = Field(0.5, ge=0, le=60)  # an alert this long after the newest fix of GPS; 60: never
-    dead_reckoning_land_s: float = Field(1.5, ge=0, le=60)  # landing in place, before the autopilot lands it blindly
+    dead_reckoning_warn_s: float = Field(0.5, ge=0, le=_NEVER_S)  # an alert, after the newest fix of GPS; 60: never
+    dead_reckoning_land_s: float = Field(1.5, ge=0, le=_NEVER_S)  # landing in place, not yet blindly
     window_s: float = Field(5.0, gt=0, le=60)  # charge counts as its highest in this time, the link as its share of it
 
     def problems(self) -> Iterator[str]:
@@ -47,13 +50,15 @@ class FailsafeParams(Params):
             if order != sorted(order):
                 keys = watched.keys
                 given = [getattr(self, key) for key in keys]
-                yield f"agent.failsafe: {', '.join(keys)} = {given}: do not escalate; order them by severity"
+                yield (
+                    f"agent.failsafe: {', '.join(keys)} = {given}: do not escalate; put them in this order of severity"
+                )
 
     def acts(self, name: str) -> list[str]:
         """Return in words what the agent does, and from where on, as far as what is called `name` wears out."""
         (row,) = (each for each in _WATCHED if each.name == name)
         limits = zip(_ESCALATION, row.limits(self), strict=True)
-        return [f"{_SAID[response]} at {row.shown(limit)}" for response, limit in limits if limit != row.never]
+        return [f"{_SAID[response]} at {limit:.0%}" for response, limit in limits if limit != row.never]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +76,6 @@ class Response(enum.IntEnum):
     WARN = 1
     RTL = 2
     LAND = 3
-
-
-_ANY_US = 1 << 62
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +99,9 @@ class _Watched:
     limits: Callable[[FailsafeParams], tuple[float, float, float]]  # of WARN, RTL and LAND
     sign: float  # 1 where more is worse, -1 where less is
     never: float  # limit that switches a response off
-    said: str  # with {} for its value
+    said: str  # with a format for its value times `scale`
+    scale: float = 100.0
     unit: str = "01"  # of its keys
-    shown: Callable[[float], str] = "{:.0%}".format
     patience_us: int = _ANY_US
 
     @property
@@ -110,7 +112,6 @@ class _Watched:
 
 
 _SAID = {Response.WARN: "warns", Response.RTL: "returns", Response.LAND: "lands"}
-_NEVER_S = 60.0
 _ESCALATION = (Response.WARN, Response.RTL, Response.LAND)
 _WATCHED = (
     _Watched(
@@ -119,7 +120,7 @@ _WATCHED = (
         limits=lambda p: (p.battery_warn_01, p.battery_rtl_01, p.battery_land_01),
         sign=-1.0,
         never=0.0,
-        said="battery at {}",
+        said="battery at {:.0f} %",
     ),
     _Watched(
         name="link",
@@ -127,7 +128,7 @@ _WATCHED = (
         limits=lambda p: (p.link_warn_01, p.link_rtl_01, p.link_land_01),
         sign=1.0,
         never=1.0,
-        said="no state of the vehicle in {} of the time",
+        said="no state of the vehicle in {:.0f} % of the time",
     ),
     _Watched(
         name="dead_reckoning",
@@ -135,9 +136,9 @@ _WATCHED = (
         limits=lambda p: (p.dead_reckoning_warn_s, _NEVER_S, p.dead_reckoning_land_s),
         sign=1.0,
         never=_NEVER_S,
-        said="no GPS for {} s, and an estimate that gets worse",
+        said="no GPS for {:.1f} s, and an estimate that gets worse",
+        scale=1.0,
         unit="s",
-        shown="{:.1f}".format,
         patience_us=2_000_000,  # to brake; room can't be made by positions that get worse
     ),
 )
@@ -153,7 +154,7 @@ def escalate(health: Health, params: FailsafeParams) -> Escalation:
         for response, limit in zip(_ESCALATION, watched.limits(params), strict=True):
             due = limit != watched.never and watched.sign * (value - limit) > 0.0
             if due and response > found.response:
-                found = Escalation(response, watched.said.format(watched.shown(value)), watched.patience_us)
+                found = Escalation(response, watched.said.format(watched.scale * value), watched.patience_us)
     return found
 
 

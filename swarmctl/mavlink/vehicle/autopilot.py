@@ -35,7 +35,7 @@ _ARMED_FLAG = 128
 _CRITICAL = 5
 _PREARM = 1 << 28
 _KNOWS_POSITION = 8 | 16  # ESTIMATOR_POS_HORIZ_REL, ESTIMATOR_POS_HORIZ_ABS
-_DRIFT_M_S2 = 0.05  # 1-sigma, of who dead-reckons: 0.6 m after 8 s (ArduCopter) to 2.7 m after 4 s (PX4) were measured
+_DRIFT_M_S2 = 0.05  # 1-sigma error without GPS over time squared; measured: 0.6 m after 8 s to 2.7 m after 4 s
 _LOST_REPORTS = 2  # one after the other, a second apart: flags drop out for a moment, too
 _LOCAL_POSITION = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED  # its time stamps are those of the state
 _SYNC_EVERY_US = 200_000
@@ -297,7 +297,7 @@ class Autopilot:
         self._accuracy("GPS_RAW_INT", message.h_acc * 1e-3 + drift_m)
 
     def _accuracy(self, source: str, sigma_m: float) -> None:
-        """Return an accuracy [m], or None for 0, which both messages use for unknown."""
+        """Take an accuracy [m] from the message that the dialect names; not 0, which both messages use for unknown."""
         if self.dialect is not None and self.dialect.horizontal_accuracy == source and 0.0 < sigma_m < np.inf:
             self.pos_accuracy_m = sigma_m
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from swarmctl.core.types import GPS_FIX_3D
+
 _UNKNOWN_SATELLITES = 255
-_FIX_3D = 3
 
 
 @dataclass(slots=True)
@@ -26,7 +27,7 @@ class VehicleHealth:
     def gps(self, message: Any, arrived_us: int) -> None:
         """Take a GPS_RAW_INT, which arrived at this monotonic time."""
         self.gps_fix = message.fix_type
-        if message.fix_type >= _FIX_3D:
+        if message.fix_type >= GPS_FIX_3D:
             self.fixed_us = arrived_us
         self.fix_missing_s = 0.0 if self.fixed_us is None else (arrived_us - self.fixed_us) * 1e-6
         self.satellites = None if message.satellites_visible == _UNKNOWN_SATELLITES else message.satellites_visible

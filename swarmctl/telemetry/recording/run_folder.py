@@ -195,9 +195,11 @@ def compare_runs(path: Path, runs: Sequence[tuple[Path, Rules]]) -> Path:
     """Write a page that sets finished runs beside each other to `path`, and return it.
 
     Raises:
-        ConfigError: a run is not finished, or a file of it has not the expected content.
+        ConfigError: a run is not finished, a file of it has not the expected content, or the page would replace one.
         StartError: the page can't be written.
     """
+    for directory, _ in runs:
+        refuse_as_output(path, directory, ".html")
     judged = [read_judged(directory, rules) for directory, rules in runs]
     try:
         return write_comparison(path, judged)

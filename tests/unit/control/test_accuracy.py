@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarmctl.control.estimation.accuracy import AccuracyMargin, AccuracyMonitor
+from swarmctl.control.estimation.accuracy import AccuracyLoss, AccuracyMonitor
 
 SECOND = 1_000_000
 PX4_AFTER_BOOT_S, PX4_CLAIM_M = [1.2, 2.2, 4.2, 9.0, 30.0], [14.1, 0.010, 0.073, 0.285, 0.290]
@@ -55,30 +55,30 @@ def test_a_vehicle_that_reports_no_accuracy_is_waited_for_briefly() -> None:
 
 
 def test_what_an_accuracy_loses_in_flight_becomes_a_margin() -> None:
-    margin, now_us = AccuracyMargin(), 0
+    loss, now_us = AccuracyLoss(), 0
     for claim_m in (None, 14.1, 0.2, 0.3):  # of an estimator that settles; the newest counts
         now_us += SECOND
-        margin.update(now_us, claim_m, is_standing=True)
-        assert margin.margin_m == 0.0
+        loss.update(now_us, claim_m, is_standing=True)
+        assert loss.margin_m == 0.0
     for claim_m, margin_m in ((0.39, 0.0), (0.7, 1.22), (100.0, 4.22), (100.0, 7.22), (0.3, 0.0), (None, 0.0)):
         now_us += SECOND
-        margin.update(now_us, claim_m, is_standing=False)
-        assert margin.margin_m == pytest.approx(margin_m)
+        loss.update(now_us, claim_m, is_standing=False)
+        assert loss.margin_m == pytest.approx(margin_m)
 
 
 def test_an_agent_that_starts_in_flight_takes_the_accuracy_it_finds() -> None:
-    margin = AccuracyMargin()
+    loss = AccuracyLoss()
     for k, (claim_m, margin_m) in enumerate(((1.0, 0.0), (1.5, 0.92))):
-        margin.update(k * SECOND, claim_m, is_standing=False)
-        assert margin.margin_m == pytest.approx(margin_m)
+        loss.update(k * SECOND, claim_m, is_standing=False)
+        assert loss.margin_m == pytest.approx(margin_m)
 
 
 def test_only_an_estimate_that_gets_worse_dead_reckons() -> None:
-    margin = AccuracyMargin()
-    margin.update(0, 0.3, is_standing=True)
-    margin.update(SECOND, 0.3, is_standing=False, fix_missing_s=2.0)
-    assert margin.dead_reckoning_s == 0.0, "it has another source of positions"
-    margin.update(2 * SECOND, 0.5, is_standing=False, fix_missing_s=3.0)
-    assert margin.dead_reckoning_s == 3.0
-    margin.update(3 * SECOND, 0.5, is_standing=False)
-    assert margin.dead_reckoning_s == 0.0, "it has a fix"
+    loss = AccuracyLoss()
+    loss.update(0, 0.3, is_standing=True)
+    loss.update(SECOND, 0.3, is_standing=False, fix_missing_s=2.0)
+    assert loss.dead_reckoning_s == 0.0, "it has another source of positions"
+    loss.update(2 * SECOND, 0.5, is_standing=False, fix_missing_s=3.0)
+    assert loss.dead_reckoning_s == 3.0
+    loss.update(3 * SECOND, 0.5, is_standing=False)
+    assert loss.dead_reckoning_s == 0.0, "it has a fix"

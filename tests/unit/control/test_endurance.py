@@ -50,8 +50,8 @@ def test_a_link_escalates(lost_01: float, expected: Response) -> None:
 
 def test_the_strongest_of_all_rows_counts_and_says_why() -> None:
     worn = replace(GOOD, battery_01=0.25, link_lost_01=0.5)
-    assert escalate(worn, PARAMS) == Escalation(RTL, "no state of the vehicle in 50% of the time")
-    assert escalate(replace(worn, battery_01=0.05), PARAMS) == Escalation(LAND, "battery at 5%")
+    assert escalate(worn, PARAMS) == Escalation(RTL, "no state of the vehicle in 50 % of the time")
+    assert escalate(replace(worn, battery_01=0.05), PARAMS) == Escalation(LAND, "battery at 5 %")
 
 
 def test_negative_control_limits_that_are_off_ask_for_nothing() -> None:

@@ -25,6 +25,7 @@ GOOD = Health(
     had_control=True,
     battery_01=1.0,
     link_lost_01=0.0,
+    dead_reckoning_s=0.0,
     pilot_override=False,
 )
 BAD_PLANS = [s for s in PlanStatus if s is not PlanStatus.OK]

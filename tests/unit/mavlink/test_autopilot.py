@@ -340,11 +340,11 @@ def test_the_accuracy_an_autopilot_claims(autopilot: int, message: Any, sigma_m:
 @pytest.mark.parametrize(
     ("base", "flags", "lost"),
     [
-        (128, (0x65,) * 2, True),
-        (128, (0x65,), False),
+        (128, (0x65, 0x65), True),
+        (128, (0x65, 0x37F), False),
         (128, (0x65, 0x37F, 0x65), False),  # it drops out for a moment
-        (128, (0x6D,) * 2, False),  # a position by optical flow is relative only
-        (0, (0x65,) * 2, False),  # on the ground an estimator may take its time
+        (128, (0x6D, 0x6D), False),  # a position by optical flow is relative only
+        (0, (0x65, 0x65), False),  # on the ground an estimator may take its time
     ],
 )
 def test_an_estimate_that_has_lost_its_position_is_not_taken(base: int, flags: tuple[int, ...], lost: bool) -> None:

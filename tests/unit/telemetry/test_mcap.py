@@ -26,7 +26,7 @@ from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.bundle import BundleOptions, bundle
 from swarmctl.ops.export import export_mcap
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
-from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
+from swarmctl.telemetry.recording.run_folder import Outcome, compare_runs, finish_run
 from swarmctl.telemetry.view.recordings import viewer_binary
 from tests.unit.telemetry.test_run_folder import UTC_US, write_run
 
@@ -57,6 +57,8 @@ def test_a_file_of_the_run_is_not_written_over(folder: Path) -> None:
         export_mcap(folder, folder / "config.toml")
     with pytest.raises(ConfigError, match="is a file of the run"):
         bundle(BundleOptions(folder=folder, output=folder / "config.toml"))
+    with pytest.raises(ConfigError, match="is a file of the run"):
+        compare_runs(folder / "config.toml", [(folder, Config().rules())] * 2)
     assert (folder / "config.toml").read_bytes() == before
 
 
