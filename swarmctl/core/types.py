@@ -64,7 +64,7 @@ class Mode(enum.IntEnum):
     IDLE = 0  # nothing is sent: before take-off, after landing
     PRIMING = 1  # setpoints flow but the autopilot still flies
     TRACKING = 2  # the plan of this tick is flown
-    REPLAY = 3  # solver failed: the shifted last certified plan is flown
+    REPLAY = 3  # no certified plan: the one before, or a refused one that comes less close, is flown
     BRAKE = 4  # no valid plan: bring the vehicle to rest
     HOLD = 5  # at rest, keep position
     LAND = 6  # the autopilot lands

@@ -50,7 +50,14 @@ class ModeSelector:
         self._params, self._lag, self._delay_us = setup.params.failsafe, setup.vehicle_model.lag(), delay_us
         self._dt_us, self._steps = controller.dt_us, controller.steps
         self._mission, self._alerts, self._note = mission, alerts, note
-        self._plan_buffer = PlanBuffer(setup.agent, self._dt_us, self._steps, setup.separation.brake_m_s2)
+        self._plan_buffer = PlanBuffer(
+            setup.agent,
+            self._dt_us,
+            self._steps,
+            setup.separation.brake_m_s2,
+            volume=setup.volume,
+            takes_refused=setup.separation.mode == "best_effort" and setup.separation.gust_m_s > 0.0,
+        )
         self._certified_us: int | None = None
         self._hold_at: Array | None = None
         self._endurance = Endurance(self._params.window_s)

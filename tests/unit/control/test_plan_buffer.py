@@ -8,6 +8,7 @@ import pytest
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Start
+from swarmctl.core.flight_volume import FlightVolume, VolumeParams
 from swarmctl.core.types import Array, Plan, PlanStatus
 from tests import builders
 
@@ -156,3 +157,32 @@ def test_the_guess_is_none_once_the_plan_has_run_out(buffer: PlanBuffer, t_us: i
     assert (buffer.guess_ned_m(t_us) is not None) is there
     assert buffer.plan is good  # the failsafe decides how old a flown plan may be
     np.testing.assert_allclose(buffer.positions_ned_m(good, t_us)[-1, 0], 2.0 + 2.0 / 3.0, atol=1e-9)
+
+
+# -- a refused plan that comes less close than all else ----------------------------------------------------------------
+
+BLOWN_CLOSE = wall(1.0)  # the plan before, which ends at 0.5 m, and braking at 0.45 m come too close to it
+OPENS = np.append([0.3, 0.36], np.linspace(0.36, 0.1, STEPS - 1))  # comes closer before it opens
+
+
+def after_a_refused_plan(buffer: PlanBuffer, status: PlanStatus = PlanStatus.NOT_CERTIFIED) -> bool:
+    """Return whether the refused plan is flown."""
+    buffer.take(moving(speed_m_s=0.5), start_at(0), [], rest)
+    refused = plan_at(100_000, OPENS, status)
+    buffer.take(refused, start_at(100_000), [BLOWN_CLOSE], lambda: plan_at(100_000, np.linspace(0.3, 0.45, STEPS + 1)))
+    return buffer.plan is refused
+
+
+@pytest.mark.parametrize("status", BAD)
+def test_a_plan_refused_for_its_distances_is_flown_where_it_comes_least_close(
+    buffer: PlanBuffer, status: PlanStatus
+) -> None:
+    assert after_a_refused_plan(buffer, status) is (status is PlanStatus.NOT_CERTIFIED)
+
+
+def test_it_is_not_where_commitments_are_flown_nor_out_of_the_volume() -> None:
+    committed = PlanBuffer(0, DT_US, STEPS, BRAKE_M_S2, takes_refused=False)
+    assert not after_a_refused_plan(committed)
+    corners = ((0.25, -9.0), (9.0, -9.0), (9.0, 9.0), (0.25, 9.0))
+    north = FlightVolume(VolumeParams(corners_ne_m=corners, floor_z_m=0.0, ceiling_z_m=-9.0))
+    assert not after_a_refused_plan(PlanBuffer(0, DT_US, STEPS, BRAKE_M_S2, volume=north))
