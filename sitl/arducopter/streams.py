@@ -101,7 +101,7 @@ def gps_raw(r: CopterReport) -> Fields:
     alt_mm = origin.alt_mm - round(e.pos_ned_m[2] * 1e3)
     speed_cm_s = min(65534, round(100 * math.hypot(*e.vel_ned_m_s[:2])))
     course_cdeg = round(math.degrees(math.atan2(e.vel_ned_m_s[1], e.vel_ned_m_s[0])) % 360.0 * 100) % 36000
-    horizontal_mm, vertical_mm = (round(1e3 * m) for m in e.pos_accuracy_m)
+    horizontal_mm, vertical_mm = (round(1e3 * m) for m in e.gps_accuracy_m)
     fix = _FIX_RTK if e.gps_ok else _NO_FIX
     place = *origin.to_geo_e7(e.pos_ned_m[0], e.pos_ned_m[1]), alt_mm
     accuracy = horizontal_mm, vertical_mm, 40, 0
@@ -152,7 +152,7 @@ def ekf_status(r: CopterReport) -> Fields:
     """Build EKF_STATUS_REPORT; its "variances" are test ratios of innovations, not metres."""
     if not r.pilot.has_origin:
         return 0.0, 0.0, 0.0, 0.0, 0.0, _EKF_NO_POSITION
-    horizontal_m, vertical_m = r.estimate.pos_accuracy_m
+    horizontal_m, vertical_m = r.estimate.gps_accuracy_m
     ratios = min(1.0, horizontal_m / _GATE_M), min(1.0, vertical_m / _GATE_M)
     return 0.02, *ratios, 0.02, 0.0, _EKF_HEALTHY
 

@@ -262,6 +262,7 @@ class Estimator:
             on_ground=self._on_ground[vehicle],
             pos_accuracy_m=accuracy_m,
             gps_ok=gps_ok,
+            gps_accuracy_m=self._accuracy_m,
             battery=self.power[vehicle],
         )
 

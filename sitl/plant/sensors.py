@@ -82,6 +82,7 @@ class Estimate(NamedTuple):
     on_ground: bool
     pos_accuracy_m: tuple[float, float] = (0.01, 0.01)  # 1 sigma as the autopilot reports it: horizontal, vertical
     gps_ok: bool = True
+    gps_accuracy_m: tuple[float, float] = (0.01, 0.01)  # the same of the receiver; without a fix the last one
     battery: Power = FULL
 
     @property

@@ -7,6 +7,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mavlink
 
+from swarmctl.control.estimation import accuracy
 from swarmctl.control.failsafe import decision
 from swarmctl.control.phases import handover
 from swarmctl.control.phases.mission_state import MissionState
@@ -19,7 +20,7 @@ from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 from tests.closed_loop.conftest import COARSE
 from tests.faults.row import Off
 from tests.faults.rows_agents import lands
-from tests.faults.simulated import ALONE, GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow
+from tests.faults.simulated import AIR, ALONE, GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow
 
 STALE_FLOWN = Off(settings=("agent.failsafe.state_max_age_s=5",))
 ALWAYS_OURS = Off(  # neither the failsafe's table nor the state machine looks at who flies
@@ -93,6 +94,14 @@ def _as_it_comes(self: StateSamples, vehicle_us: int, arrived_us: int, *values: 
 
 _TAKE = StateSamples._take
 FROM_THE_GROUND = (*COARSE, "swarm.agents=2", "start.spacing_m=4", "mission.kind=line", "mission.duration_s=60")
+HOVER_BESIDE = (  # the drifting estimate takes the first towards the second
+    *COARSE,
+    AIR,
+    "swarm.agents=2",
+    "mission.kind=hover",
+    "mission.duration_s=15",
+    "start.positions_ned_m=[[0,0,-2],[-1.2,0,-2]]",
+)
 MOBILE = (*SWAP, "sitl.battery.capacity_mah=3000", "agent.failsafe.window_s=1")
 
 ROWS = (
@@ -260,6 +269,30 @@ ROWS = (
         lasts_s=5.0,
         finally_={"the agent sends": nothing_is_sent},
         off=ALWAYS_OURS,
+    ),
+    SimulatedRow(
+        name="gps-lost",
+        event="one of four in a swap loses GPS, and its autopilot goes on by dead reckoning",
+        reaction="it brakes and lands while it still knows where it is; the others keep clear",
+        within_s=6.0,
+        protection="escalation by the time without GPS (agent.failsafe.dead_reckoning_land_s)",
+        happens=link("gps_loss", 0.0),
+        reacts=lambda scene: any(e["response"] == "LAND" for e in scene.events(VICTIM, "escalation")) and lands(scene),
+        lasts_s=12.0,
+        off=Off(settings=("agent.failsafe.dead_reckoning_land_s=60",)),
+    ),
+    SimulatedRow(
+        name="gps-lost-beside",
+        event="one of two that hover 1.2 m apart loses GPS, and drifts towards the other, before it lands",
+        reaction="the other makes room",
+        within_s=4.0,
+        protection="distance that peers keep for the accuracy that is lost (AccuracyLoss)",
+        scene=HOVER_BESIDE,
+        due=lambda scene: scene.mission_s >= 2.0,
+        happens=link("gps_loss", 0.0, vehicle=0),
+        reacts=lambda scene: scene.true(1)["pos_ned_m"][0] < -1.5,
+        lasts_s=6.0,
+        off=Off(patches=((accuracy, "_SIGMAS", 0.0),)),
     ),
     SimulatedRow(
         name="battery-low",
