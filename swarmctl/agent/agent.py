@@ -300,7 +300,7 @@ class Agent:
             disturbance_ned_m_s2=self._own_state.estimate.disturbance_ned_m_s2,
             margins_m=(jump_m, accuracy_m, self._deadlines.margin_m, self._planner.directive.margin_m),
         )
-        self._separation.publish(self._ports.clock.utc_us())
+        self._separation.publish(self._ports.clock.utc_us(), unsure_m=jump_m + accuracy_m)
         self._interest.update(state, self._ports.clock.utc_us())
 
     def _advance(self, now_us: int, state: VehicleState | None) -> None:

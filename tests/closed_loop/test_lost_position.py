@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
+from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.control.estimation import accuracy
 from swarmctl.mavlink.vehicle import autopilot
 from tests.closed_loop.conftest import Flight, Fly
@@ -25,6 +26,7 @@ BESIDE = (
     "mission.duration_s=15",
     "start.positions_ned_m=[[0,0,-2],[-1.2,0,-2]]",
 )
+GUARANTEED = ("separation.mode=guaranteed",)
 NOT_LANDED = ("agent.failsafe.dead_reckoning_land_s=60",)  # before its flags say that it has no position
 
 
@@ -74,7 +76,11 @@ def separation_aloft_m(flight: Flight) -> float:
     return float(np.linalg.norm(np.diff(flight.pos_ned_m[aloft, :2], axis=1), axis=2).min())
 
 
-@pytest.mark.parametrize("landing", [(), NOT_LANDED, COPTER], ids=["lands", "goes-on", "arducopter"])
+@pytest.mark.parametrize(
+    "landing",
+    [(), NOT_LANDED, COPTER, GUARANTEED, (*GUARANTEED, *NOT_LANDED)],
+    ids=["lands", "goes-on", "arducopter", "guaranteed-lands", "guaranteed-goes-on"],
+)
 def test_peers_keep_away_from_who_drifts(fly: Fly, landing: Sequence[str]) -> None:
     flight = fly_without_gps(fly, (*BESIDE, *landing))
     assert separation_aloft_m(flight) >= SEPARATION_M
@@ -86,6 +92,14 @@ def test_negative_control_who_drifts_comes_close_to_peers_that_are_not_told(
 ) -> None:
     monkeypatch.setattr(accuracy, "_SIGMAS", 0.0)
     assert separation_aloft_m(fly_without_gps(fly, (*BESIDE, *NOT_LANDED))) < 0.6
+
+
+def test_negative_control_commitments_are_relied_on_whose_tube_leaves_out_the_estimate(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = Coordination.publish
+    monkeypatch.setattr(Coordination, "publish", lambda self, utc_us, *, unsure_m: told(self, utc_us, unsure_m=0.0))
+    assert separation_aloft_m(fly_without_gps(fly, (*BESIDE, *GUARANTEED, *NOT_LANDED))) < 0.6
 
 
 def test_all_who_have_lost_gps_land_soon_though_none_finds_room(fly: Fly) -> None:

@@ -31,7 +31,7 @@ from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
-from swarmctl.core.types import Array, Phase, VehicleState
+from swarmctl.core.types import MAX_MARGIN_M, Array, Phase, VehicleState
 
 _SUSPECT_US = 5_000_000  # without a message, after which a peer is suspected: bursts of loss end sooner
 _GAP_US = 1_000_000  # without a fresh state, after which nothing is committed any more
@@ -101,7 +101,7 @@ class Coordination:
         self._is_committed = False
         self._tube_m = separation.budget.tube_m
         self._tube = Tube(self._tube_m)
-        self._grip = Grip.HELD
+        self._grip, self._error_m = Grip.HELD, 0.0
         self._entered_now, self._entered_ahead = Encounters(), Encounters()  # where a plan begins now, or ahead
         self._clock_error_max_us = 1e6 * params.clock_error_max_s
         self._membership = Membership(agent, peers)
@@ -229,8 +229,14 @@ class Coordination:
         assert self._commitments.flown is not None
         return self._commitments.flown.sample(t_utc_us)
 
-    def publish(self, utc_us: int) -> None:
-        """Apply rule 5: publish the own message, once there is a committed trajectory."""
+    def publish(self, utc_us: int, *, unsure_m: float) -> None:
+        """Apply rule 5: publish the own message, once there is a committed trajectory.
+
+        Args:
+            utc_us: now.
+            unsure_m: by how much more the vehicle may be away from its estimate than distances leave room for. Peers
+                keep it from its path already; they do so while it may be outside its tube.
+        """
         if self._commitments.committed is None:
             return
         self._seq += 1
@@ -242,7 +248,7 @@ class Coordination:
             sent_utc_us=utc_us,
             is_committed=self._is_committed,
             committed=self._commitments.committed,
-            tube_m=self._tube.radius_m,
+            tube_m=max(self._tube.radius_m, min(MAX_MARGIN_M, self._error_m + unsure_m)),
             proposal=self._commitments.proposal,
             acknowledged=acknowledgements(self._peer_trajectories.newest, self._ended | exclusions.promised),
             exclusions=exclusions,
@@ -270,7 +276,7 @@ class Coordination:
         commitments.wait_for(state.pos_ned_m, utc_us, since_us, self._tube_m)
         assert commitments.committed is not None and commitments.flown is not None
         pos, vel = map(np.array, commitments.committed.at(utc_us))
-        error_m = float(np.linalg.norm(state.pos_ned_m - pos))
+        self._error_m = error_m = float(np.linalg.norm(state.pos_ned_m - pos))
         error_m_s = float(np.linalg.norm(state.vel_ned_m_s - vel))
         late_m = math.dist(pos, commitments.flown.at(utc_us)[0])
         if self._tube.update(utc_us, error_m, error_m_s, late_m):

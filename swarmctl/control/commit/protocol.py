@@ -42,11 +42,12 @@ The proof rests on these assumptions, each of which is watched in flight:
   one's, with room for all that it does not know of the other's clock. Beyond `agent.commit.clock_error_max_s` nothing
   new is proposed.
 - Vehicles stay in their tubes: each may miss what it is committed to by half of the committed distance beyond touching
-  bodies. `swarmctl.control.commit.tube` watches it; the event `tracking_violation` reports who leaves its tube, and
-  `commitments` at the end the worst error of the flight. A vehicle that lags does not chase its commitment: it is flown
-  later along the same places (`Commitments.wait_for`), and proposes from there. To the proof a proposal is any
-  trajectory, whatever it leaves; until that is committed, the vehicle is outside the tube that its peers had been told
-  of, and they keep clear of it as of one that does not take part.
+  bodies, what its estimator has lost of its accuracy included. `swarmctl.control.commit.tube` watches it; the event
+  `tracking_violation` reports who leaves its tube, and `commitments` at the end the worst error of the flight. A
+  vehicle that lags does not chase its commitment: it is flown later along the same places (`Commitments.wait_for`), and
+  proposes from there. To the proof a proposal is any trajectory, whatever it leaves; until that is committed, the
+  vehicle is outside the tube that its peers had been told of, and they keep clear of it as of one that does not take
+  part.
 - Commitments are kept. A commitment changes without acknowledgement only where a vehicle first commits at speed, where
   it is blown far from its tube, and by `evade`, before something that does not take part: around it, to a stop, or
   above it. An agent that finds a peer's commitment in conflict with its own (`conflicting_peers`), or a peer outside
