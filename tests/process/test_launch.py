@@ -367,7 +367,8 @@ def test_operator_verbs(
         (1, True, "TRACK"),
     ]
     excluded = launched.verb("exclude", "--peer", "1")
-    assert excluded.returncode == 0, excluded.stderr
+    assert excluded.returncode == 4
+    assert re.search(r"agent-0 refuses: agent-1 was heard \d\.\d s ago, so it has not ended", excluded.stdout)
     assert verb("exclude", "--peer", "255").returncode == 2
     landed = verb("land")
     assert landed.returncode == 0, landed.stderr

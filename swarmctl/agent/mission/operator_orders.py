@@ -62,11 +62,17 @@ class OperatorOrders:
     def _refusal(self, order: Order, now_us: int) -> str:
         """Obey an order; return why it is refused, or ""."""
         if order.verb == EXCLUDE:
-            self._world_model.exclude(int(order.arguments[PEER]))
-            return ""
+            return self._exclude(int(order.arguments[PEER]))
         refusal = self._offer_mission(order, now_us) if order.verb == MISSION else ""
         state = self._ports.autopilot.poll(now_us)
         return refusal or self._state_machine.operator(order, now_us, self._ports.utc_of_us(now_us), state)
+
+    def _exclude(self, peer: int) -> str:
+        """Believe that a peer has ended; return why not, or ""."""
+        life_sign = self._world_model.life_sign(peer, self._ports.clock.utc_us())
+        if not life_sign:
+            self._world_model.exclude(peer)
+        return life_sign
 
     def _offer_mission(self, order: Order, now_us: int) -> str:
         """Have the state machine know the mission of an order; return why it is not flown, or ""."""

@@ -30,6 +30,7 @@ from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase
 
 _COMPANY_US = 10_000_000  # a peer whose last status is older has left
+_SILENT_US = 2_000_000  # ten statuses; who is heard within it has not ended
 _RECENT_PATH_US = 300_000  # largest age of a path that is compared with commitments
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 _STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
@@ -107,7 +108,10 @@ class WorldModel:
     def _end_of_a_peer(self, sender: str, payload: bytes, utc_us: int) -> Order | None:
         """Return the order to go on without a peer, from who runs its process and has seen it end; or None."""
         order = self._ends.take(sender, payload, utc_us)
-        if order is None or (order.verb == EXCLUDE and order.arguments[PEER] in self._vouchers.get(sender, ())):
+        if order is None:
+            return None
+        if order.verb == EXCLUDE and order.arguments[PEER] in self._vouchers.get(sender, ()):
+            self.exclude(int(order.arguments[PEER]))
             return order
         self.refusals.add(sender, topics.ENDED.name, IDENTITY, utc_us)
         return None
@@ -291,6 +295,13 @@ class WorldModel:
     def exclude(self, agent: int) -> None:
         """Believe that the process of a peer has ended; another process under its number takes part again."""
         self._vouched[agent] = self._boot_id(agent)
+
+    def life_sign(self, agent: int, utc_us: int) -> str:
+        """Return what speaks against an operator's word that a peer has ended: it was just heard; or ""."""
+        age_us = utc_us - self._status_us.get(agent, utc_us - _SILENT_US)
+        if self.has_ended(agent) or age_us >= _SILENT_US:
+            return ""
+        return f"{agent_name(agent)} was heard {age_us * 1e-6:.1f} s ago, so it has not ended"
 
     def has_ended(self, agent: int) -> bool:
         """Return whether there is evidence that a peer commits to nothing more.

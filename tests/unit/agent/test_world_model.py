@@ -345,7 +345,20 @@ def test_only_who_runs_an_agent_says_that_it_has_ended(sender: str, peer: int, b
     bench.hub.carry(sender, topics.ENDED, encode_message(order))
     bench.hub.carry(sender, topics.ENDED, encode_message(CommandMessage("land", -1, bench.clock.utc_us() + 1)))
     assert bench.tick() == [EXCLUDE] * believed
+    assert bench.world_model.has_ended(1) is believed
     assert bench.world_model.refusals.by_reason == {"identity": 2 - believed}
+
+
+def test_what_an_operator_says_of_a_peer_that_was_just_heard_is_doubted() -> None:
+    bench = Bench()
+    assert bench.world_model.life_sign(1, bench.clock.utc_us()) == "", "it has never been heard"
+    bench.peer.publish(topics.STATUS, encode_message(builders.status_message(agent=1)))
+    bench.tick()
+    heard_us = bench.clock.utc_us()
+    assert "heard 1.5 s ago, so it has not ended" in bench.world_model.life_sign(1, heard_us + 1_500_000)
+    assert bench.world_model.life_sign(1, heard_us + 2_000_000) == ""
+    bench.world_model.exclude(1)  # as a supervisor says that has seen its process end
+    assert bench.world_model.life_sign(1, heard_us) == ""
 
 
 def test_who_has_never_been_heard_is_excused_until_it_is_heard() -> None:
