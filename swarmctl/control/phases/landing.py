@@ -12,7 +12,7 @@ import numpy as np
 
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.state_machine_params import StateMachineParams
-from swarmctl.control.phases.trajectories import Trajectories, is_at
+from swarmctl.control.phases.trajectories import BegunTrajectory, Trajectories, is_at
 from swarmctl.control.reference.landing_places import Taken, landing_place_ned_m, nearest_in_plane_m
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.types import Array, VehicleState
@@ -73,8 +73,8 @@ class Landing:
         if begun is None:
             return True
         if not self.in_place:
-            return not paused and self._is_home(inputs, state, begun.trajectory.to_ned_m, controls=controls)
-        if inputs.now_us - begun.began_us <= (begun.trajectory.travel_s + _SETTLE_S) * 1e6:
+            return not paused and self._is_home(inputs, state, begun, controls=controls)
+        if _is_under_way(begun, inputs.now_us):
             return False
         if self._has_room(inputs, state, controls=controls):
             return self._is_at_rest(state)
@@ -88,9 +88,15 @@ class Landing:
     def _is_at_rest(self, state: VehicleState) -> bool:
         return is_at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
 
-    def _is_home(self, inputs: PhaseInputs, state: VehicleState, target_ned_m: Array, *, controls: bool) -> bool:
-        """Return whether the vehicle is at its landing place (3,), or send it to one that is not over an obstacle."""
+    def _is_home(self, inputs: PhaseInputs, state: VehicleState, begun: BegunTrajectory, *, controls: bool) -> bool:
+        """Return whether the vehicle is at its landing place, or send it to one that is not over an obstacle.
+
+        Where no place is, the way to the one with most room is flown to its end before another is looked for.
+        """
+        target_ned_m = begun.trajectory.to_ned_m
         if controls and not self._is_clear(inputs, state, target_ned_m):
+            if self._beside and _is_under_way(begun, inputs.now_us):
+                return False
             self._beside = True
             self._go_near(target_ned_m, inputs, state)
             self._trajectories.keep_destination()
@@ -118,3 +124,7 @@ class Landing:
     def _is_clear(self, inputs: PhaseInputs, state: VehicleState, place_ned_m: Array) -> bool:
         """Return whether no known obstacle's keep-out is on the way down from a place (3,)."""
         return all(o.descent_distance_m(place_ned_m) >= o.keep_out_m for o in inputs.obstacles(state.pos_ned_m))
+
+
+def _is_under_way(begun: BegunTrajectory, now_us: int) -> bool:
+    return now_us - begun.began_us <= (begun.trajectory.travel_s + _SETTLE_S) * 1e6

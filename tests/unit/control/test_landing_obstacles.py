@@ -107,6 +107,16 @@ def test_a_pause_on_the_way_beside_an_obstacle_ends_with_the_same_way() -> None:
     np.testing.assert_allclose(destination(flight), place)
 
 
+def test_where_no_place_is_free_the_way_to_the_one_with_most_room_is_flown() -> None:
+    """A way that began anew in every tick would always be one of full length."""
+    grid_m = 2.4 * np.arange(-12, 13)  # discs of 1.75 m leave no gap
+    flight = returning(*(BALL.model_copy(update={"center_ned_m": (n, e, DOWN)}) for n in grid_m for e in grid_m))
+    flight.run(0.2)
+    begun = flight.mission.landing._trajectories.current
+    flight.run(1.0)
+    assert flight.mission.landing._trajectories.current is begun
+
+
 def test_after_the_timeout_it_lands_even_above_an_obstacle() -> None:
     flight = landing(BALL)
     assert Verb.LAND not in flight.run(19.0)
