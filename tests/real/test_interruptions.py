@@ -115,10 +115,14 @@ def lose_gps(here: Field, index: int) -> None:
     here.witness.set_parameter(index, "SIM_GPS_DISABLE", 1.0)
 
 
-@pytest.mark.parametrize("kind", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
-def test_who_loses_gps_among_others_lands_and_they_keep_away(field: Fielder, kind: Kind) -> None:
+@pytest.mark.parametrize(
+    ("kind", "sets"),
+    [(PX4, ()), (PX4, ("--set", "separation.mode=guaranteed")), (ARDUCOPTER, ())],
+    ids=["px4", "px4-guaranteed", "arducopter"],
+)
+def test_who_loses_gps_among_others_lands_and_they_keep_away(field: Fielder, kind: Kind, sets: tuple[str, ...]) -> None:
     here = field(PX4, 3) if kind is PX4 else booted(field, 3)
-    launched = here.launch(PX4_CONFIG if kind is PX4 else "tests/real/three_arducopters.toml")
+    launched = here.launch(PX4_CONFIG if kind is PX4 else "tests/real/three_arducopters.toml", *sets)
     launched.until_phase("TRACK", 3)
     time.sleep(5.0)
     lose_gps(here, 1)
