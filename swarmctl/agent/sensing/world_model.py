@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import replace
 
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
@@ -21,6 +22,7 @@ from swarmctl.control.collision.separation import (
     aligned,
     keep_out_along,
     keep_out_of_obstacle,
+    not_driving_away_m,
 )
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.obstacle import Obstacle
@@ -285,9 +287,11 @@ class WorldModel:
             age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
             age_margin_m = budget.age_margin_m(age_s, parked=self._is_parked(path.agent))
             apart_m = budget.barrier_peer_m(margin_m, path.margin_m, age_margin_m)
-            found.append(
-                body_of_peer(path, act_utc_us, ahead_s, apart_m, filters=filters, brake_m_s2=self._params.brake_m_s2)
-            )
+            body = body_of_peer(path, act_utc_us, ahead_s, apart_m, filters=filters, brake_m_s2=self._params.brake_m_s2)
+            if age_s > self._params.lost_after_s:  # plans don't give way to its age either, see `keep_out_along`
+                least_m = budget.barrier_peer_m(margin_m, path.margin_m, 0.0)
+                body = replace(body, apart_m=not_driving_away_m(apart_m, math.dist(body.pos_ned_m, pos_ned_m), least_m))
+            found.append(body)
         apart_m = budget.barrier_obstacle_m(margin_m)
         seen = self._visible(pos_ned_m, act_utc_us)
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in seen.values()]

@@ -235,7 +235,7 @@ def keep_out_along(
     radius_m = budget.planned_peer_m(path.margin_m, budget.age_margin_m(age_s, parked))
     if here_ned_m is not None and age_s > params.lost_after_s:
         apart_m = math.dist(points_ned_m[0, :2], here_ned_m[:2])  # level, as is kept from a silent peer
-        radius_m = min(radius_m, max(apart_m, budget.planned_peer_m(path.margin_m, 0.0)))
+        radius_m = not_driving_away_m(radius_m, apart_m, budget.planned_peer_m(path.margin_m, 0.0))
     return KeepOut(
         pos_ned_m=points_ned_m,
         radius_m=radius_m,
@@ -245,6 +245,11 @@ def keep_out_along(
         downwash=params.downwash,
         key=path.agent,
     )
+
+
+def not_driving_away_m(wanted_m: float, apart_m: float, least_m: float) -> float:
+    """Return a distance to keep from a silent peer that is no larger than the present one, but at least `least_m`."""
+    return min(wanted_m, max(apart_m, least_m))
 
 
 def keep_out_of_obstacle(
