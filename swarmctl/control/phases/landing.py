@@ -48,6 +48,8 @@ class Landing:
     ) -> None:
         self._params, self._agent, self._apart_m = params, agent, apart_m
         self._start_ned_m, self._trajectories, self._volume = start_ned_m, trajectories, volume
+        # Neighbouring start positions may be as near as distances allow, and each is reached with a tolerance.
+        self._home_apart_m = apart_m - params.apart_m - 2.0 * params.land_m
         self.in_place = False
         self._beside = False  # its landing place is beside the start position, which an obstacle takes
 
@@ -91,6 +93,8 @@ class Landing:
     def _is_home(self, inputs: PhaseInputs, state: VehicleState, begun: BegunTrajectory, *, controls: bool) -> bool:
         """Return whether the vehicle is at its landing place, or send it to one that is not over an obstacle.
 
+        It waits while another vehicle is there, whoever flies that and at whatever height, until its time is over.
+
         Where no place is, the way to the one with most room is flown to its end before another is looked for.
         """
         target_ned_m = begun.trajectory.to_ned_m
@@ -101,8 +105,11 @@ class Landing:
             self._go_near(target_ned_m, inputs, state)
             self._trajectories.keep_destination()
             return False
-        arrived = is_at(state, target_ned_m, self._params.land_m, self._params.land_m_s)
-        return arrived and (not self._beside or self._has_room(inputs, state, controls=controls))
+        if not is_at(state, target_ned_m, self._params.land_m, self._params.land_m_s):
+            return False
+        if self._beside or not controls:
+            return self._has_room(inputs, state, controls=controls)
+        return nearest_in_plane_m(state.pos_ned_m, inputs.others_ned_m()) >= self._home_apart_m
 
     def _go_near(self, wanted_ned_m: Array, inputs: PhaseInputs, state: VehicleState) -> None:
         """Begin the way to the free place nearest to one (3,), as far as it can be told."""
