@@ -35,7 +35,7 @@ class LaunchResult:
             return EXIT_INTERRUPTED
         if self.could_not_start and not self.has_armed:
             return EXIT_START
-        if self.landed_by_operator and not self.problems:
+        if self.landed_by_operator and not (self.problems or violated):
             return EXIT_INTERRUPTED
         return EXIT_MISSION if self.problems or violated else EXIT_OK
 

@@ -170,3 +170,21 @@ def test_who_lands_the_vehicle_of_another_agent_is_told_what_its_parameters_were
     assert capsys.readouterr().out.startswith(said)
     services.children.clear()
     services.stop(0.0)
+
+
+@pytest.mark.parametrize(
+    ("result", "violated", "code"),
+    [
+        (LaunchResult(), False, 0),
+        (LaunchResult(), True, 4),
+        (LaunchResult(landed_by_operator=True), False, 130),
+        (LaunchResult(landed_by_operator=True), True, 4),
+        (LaunchResult(landed_by_operator=True, interrupted=True), True, 130),
+        (LaunchResult(interrupted=True, left=("vehicle 1",)), False, 4),
+        (LaunchResult(could_not_start=True), True, 3),
+    ],
+)
+def test_a_violation_is_told_by_the_exit_code_unless_ctrl_c_has_ended_the_flight(
+    result: LaunchResult, violated: bool, code: int
+) -> None:
+    assert result.exit_code(violated) == code
