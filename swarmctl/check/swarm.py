@@ -21,6 +21,7 @@ from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
 _FAR_M = 30.0  # horizontal distance from the start that is worth a note
+_SLOPE_M = 5.0  # between the lowest and the highest place of a field
 _SWAPPED_BY_M = 0.5  # least saving that reports two vehicles as swapped
 
 
@@ -205,6 +206,36 @@ def _apart(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
     ]
 
 
+def _heights(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
+    """Compare the heights at which vehicles stand: one that estimates another height passes peers as if far above."""
+    placed = [(v.pos_ned_m[2], v.agent) for v in vehicles if v.pos_ned_m is not None and v.landed is Landed.ON_GROUND]
+    if len(placed) < 2:
+        return []
+    (highest_m, i), (lowest_m, j) = min(placed), max(placed)
+    apart_m, noted_m = lowest_m - highest_m, 0.5 * config.separation.radius_m
+
+    def line(verdict: Verdict, advice: str = "", weight: int = 0) -> list[Finding]:
+        return [
+            Finding(
+                agent=SWARM,
+                topic="heights",
+                verdict=verdict,
+                found=f"up to {apart_m:.2f} m apart on the ground",
+                wanted=f"half of separation.radius_m, {noted_m:.2f} m, on level ground",
+                advice=advice,
+                weight=weight,
+            )
+        ]
+
+    if apart_m <= noted_m:
+        return line(OK)
+    advice = (
+        f"the vehicle of agent {i} estimates to stand {apart_m:.1f} m above that of agent {j}: if it does not, they "
+        "meet where they mean to pass above each other; give both the same height of the origin"
+    )
+    return line(FIX, advice, 78) if apart_m > _SLOPE_M else line(NOTE, advice, 8)
+
+
 def _radius(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
     """Compare the separation distance with what bodies, tracking and the least accurate estimator need."""
     told = [v.pos_accuracy_m for v in vehicles if v.pos_accuracy_m is not None]
@@ -266,6 +297,7 @@ _SWARM_ROWS: tuple[Callable[[Sequence[VehicleFacts], Config], list[Finding]], ..
     _duplicates,
     _origins,
     _apart,
+    _heights,
     _radius,
     _volume,
     _swapped,

@@ -433,6 +433,8 @@ def test_the_built_in_simulator_needs_no_fixing_of_what_the_agent_sets_itself() 
     [
         ("system ids", {"sysid": 1}, FIX, "own"),
         ("distances", {"pos_ned_m": (0.5, 0.0, 0.0)}, FIX, "apart"),
+        ("heights", {"pos_ned_m": (1.0, 0.0, -0.6)}, NOTE, "above that of agent 0"),
+        ("heights", {"pos_ned_m": (1.0, 0.0, -6.0)}, FIX, "6.0 m above that of agent 0"),
     ],
 )
 def test_swarm_rows(config: Config, topic: str, second: dict[str, Any], verdict: Verdict, word: str) -> None:
