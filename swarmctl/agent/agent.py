@@ -325,7 +325,8 @@ class Agent:
 
     def _phase_inputs(self, now_us: int, state: VehicleState | None) -> PhaseInputs:
         autopilot, directive, phase = self._ports.autopilot, self._planner.directive, self._mission.phase
-        utc_us = self._ports.utc_of_us(now_us)
+        utc_us, accuracy_m = self._ports.utc_of_us(now_us), autopilot.pos_accuracy_m
+        others_ned_m = partial(self._world_model.others_ned_m, utc_us)
         return PhaseInputs(
             now_us=now_us,
             utc_us=utc_us,
@@ -338,12 +339,12 @@ class Agent:
             cut_off=directive.cut_off or self._controller_watch.suspended,
             peers=self._world_model.peers,
             excused=self._world_model.excused,
-            others_ned_m=partial(self._world_model.others_ned_m, utc_us),
+            others_ned_m=others_ned_m,
             obstacles=self._world_model.obstacles_at_rest,
             arm_in=None if autopilot.dialect is None else autopilot.dialect.arm_in,
             boots=autopilot.clock.boots,
             refusal=self._vehicle_setup.refusal if phase <= Phase.ARM else "",
-            unsettled=self._start_conditions.unsettled(now_us, autopilot.pos_accuracy_m),
+            unsettled=self._start_conditions.unsettled(now_us, accuracy_m, state, others_ned_m),
             overload=self._deadlines.level,
             escalation=self._modes.escalation,
             setpoints_stopped=self._deadlines.stop_cause(now_us),

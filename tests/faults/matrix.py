@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from itertools import chain
 
-from tests.faults import rows_agents, rows_bus, rows_descents, rows_elsewhere, rows_processes, rows_solver, rows_vehicle
+from tests.faults import (
+    rows_agents,
+    rows_bus,
+    rows_descents,
+    rows_elsewhere,
+    rows_processes,
+    rows_solver,
+    rows_start,
+    rows_vehicle,
+)
 from tests.faults.row import Row
 
 PARTS: tuple[tuple[str, tuple[Row, ...]], ...] = (
@@ -13,6 +22,7 @@ PARTS: tuple[tuple[str, tuple[Row, ...]], ...] = (
     ("Agents, hosts, clocks, processors", rows_agents.ROWS),
     ("Vehicles, autopilots, pilots", rows_vehicle.ROWS),
     ("A vehicle that comes down above another or an obstacle", rows_descents.ROWS),
+    ("Around the start", rows_start.ROWS),
     ("Tests that are rows", rows_elsewhere.ROWS),
     ("Processes, disk, descriptors, terminal, start", rows_processes.ROWS),
 )

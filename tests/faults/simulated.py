@@ -232,7 +232,8 @@ class _Watch:
 
     def __init__(self, row: SimulatedRow) -> None:
         self._row = row
-        self._disarmed: set[int] = set()
+        self._armed: set[int] = set()  # at any time since the event
+        self._disarmed: set[int] = set()  # after that
         self._left: set[int] = set()
 
     def see(self, scene: Scene) -> None:
@@ -254,8 +255,9 @@ class _Watch:
         speed_m_s = float(np.linalg.norm(state["vel_ned_m_s"]))
         require(speed_m_s < self._row.fastest_m_s, f"vehicle {i} flies away at {speed_m_s:.1f} m/s")
         if not state["armed"]:
-            self._disarmed.add(i)
+            self._disarmed |= {i} & self._armed
             return
+        self._armed.add(i)
         require(i not in self._disarmed or scene.phase(i) <= Phase.ARM, f"vehicle {i} was armed again")
         if state["flight_mode"] != FlightMode.EXTERNAL:
             self._left |= {i} if scene.phase(i) > Phase.GOTO_START else set()

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.collision.separation import radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
 from swarmctl.control.phases.mission_state import MissionState
-from swarmctl.core.types import Phase
+from swarmctl.control.reference.landing_places import nearest_in_plane_m
+from swarmctl.core.types import Array, Landed, Phase, VehicleState
 
 _START_ALERT_DELAY_US = 3_000_000  # time on the ground after which the unmet condition is raised as an alert
+_APART_FOR_US = 4_000_000  # estimates wander: vehicles have to be apart for as long as accuracy has to be steady
 
 
 class StartConditions:
@@ -25,16 +29,40 @@ class StartConditions:
         self._setup, self._mission, self._alerts = setup, mission, alerts
         self._accuracy = AccuracyMonitor()
         self._waits_since_us = 0
+        self._close_us: int | None = None  # when another vehicle was last seen too close
 
-    def unsettled(self, now_us: int, pos_accuracy_m: float | None) -> str:
-        """Return why arming must wait: the estimator still settles, or is too inaccurate for the separation; or ""."""
+    def unsettled(
+        self,
+        now_us: int,
+        pos_accuracy_m: float | None,
+        state: VehicleState | None,
+        others_ned_m: Callable[[], Sequence[Array]],
+    ) -> str:
+        """Return why arming must wait, or "".
+
+        The estimator still settles, or is too inaccurate for the separation, or another vehicle stands too close: the
+        autopilot, which climbs first, knows no peers.
+
+        Args:
+            now_us: monotonic time.
+            pos_accuracy_m: newest reported accuracy, 1-sigma; None while there is none.
+            state: newest one.
+            others_ned_m: returns the position (3,) of each peer.
+        """
         if len(self._setup.starts_ned_m) == 1 or self._mission.phase > Phase.STANDBY:
             return ""
         self._accuracy.update(now_us, pos_accuracy_m)
         accuracy_m = self._accuracy.worst_m or 0.0  # if not reported, only body size and tracking error are checked
-        return self._accuracy.unsettled(now_us) or radius_problem(
-            self._setup.separation, accuracy_m, self._setup.drift_m
-        )
+        separation = self._setup.separation
+        problem = self._accuracy.unsettled(now_us) or radius_problem(separation, accuracy_m, self._setup.drift_m)
+        if problem or state is None or state.landed is not Landed.ON_GROUND:
+            return problem
+        least_m = separation.budget.standing_m(accuracy_m)
+        nearest_m = nearest_in_plane_m(state.pos_ned_m, others_ned_m())
+        if nearest_m < least_m:
+            self._close_us = now_us
+        is_close = self._close_us is not None and now_us - self._close_us < _APART_FOR_US
+        return f"{least_m:.2f} m to the next vehicle (now {nearest_m:.2f} m)" if is_close else ""
 
     def report(self, now_us: int) -> None:
         """Raise the unmet condition as an alert once the agent has waited for a while; clear it once it is met."""

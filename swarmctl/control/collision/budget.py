@@ -57,6 +57,14 @@ class SeparationBudget:
         """
         return self.body_m + self.tracking_m + 2.0 * math.sqrt(2.0) * accuracy_m + 2.0 * drift_m
 
+    def standing_m(self, accuracy_m: float) -> float:
+        """Return the least level distance at which vehicles may stand that are to take off, by their estimates.
+
+        Plans come no closer than `certify_slack_m` below `radius_m`; two estimates of rms `accuracy_m` may be off by
+        twice the rms of their difference.
+        """
+        return self.radius_m - self.certify_slack_m - 2.0 * math.sqrt(2.0) * accuracy_m
+
     # -- hard minimum distances of plans ------------------------------------------------------------------------------
 
     @property

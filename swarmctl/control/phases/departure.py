@@ -15,8 +15,14 @@ _REFUSED_CLIMB_M = 0.25  # heights are estimates: a start at the least height mu
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
 
 
-def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[int]) -> str:
-    """Return the first condition for arming that is not met, or ""; `peers` are the agents to wait for."""
+def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[int], top_ned_m: Array) -> str:
+    """Return the first condition for arming that is not met, or "".
+
+    Args:
+        inputs, state: of this tick.
+        peers: agents to wait for.
+        top_ned_m: (3,) where its climb would end.
+    """
     if state.landed not in (Landed.ON_GROUND, Landed.IN_AIR):
         return "the autopilot to tell whether it has landed"
     if not inputs.armable:
@@ -26,7 +32,18 @@ def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[i
     there = {agent for agent, peer in inputs.peers().items() if peer.phase >= Phase.STANDBY and peer.alive}
     if absent := peers - there:
         return f"{names_of(absent)} to stand by"
+    if state.landed is Landed.ON_GROUND and (obstacle := _obstacle_over(inputs, top_ned_m)):
+        return obstacle
     return "the autopilot's answers" if inputs.busy else ""
+
+
+def _obstacle_over(inputs: PhaseInputs, top_ned_m: Array) -> str:
+    """Return which obstacle has to go before the autopilot, which avoids none, can climb to (3,), or ""."""
+    for obstacle in inputs.obstacles(top_ned_m):
+        apart_m = obstacle.descent_distance_m(top_ned_m)
+        if apart_m < obstacle.keep_out_m:
+            return f"an obstacle {apart_m:.2f} m beside its climb to go (keep_out_m = {obstacle.keep_out_m:g})"
+    return ""
 
 
 def names_of(agents: Iterable[int]) -> str:

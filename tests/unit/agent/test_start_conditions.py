@@ -5,13 +5,16 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import cast
 
+import numpy as np
 import pytest
 
 from swarmctl.agent.mission.start_conditions import StartConditions
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.phases.mission_state import MissionState
-from swarmctl.core.types import Phase
+from swarmctl.core.types import Landed, Phase
+from tests import builders
 
 SECOND = 1_000_000
 
@@ -30,3 +33,23 @@ def test_an_agent_that_waits_no_longer_does_not_say_so(phase: Phase, waits_for: 
     mission.phase, mission.waits_for = phase, waits_for
     conditions.report(5 * SECOND)
     assert alerts.newest(5 * SECOND) is None
+
+
+def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_while() -> None:
+    setup = SimpleNamespace(starts_ned_m=np.zeros((2, 3)), separation=SeparationParams(), drift_m=0.0)
+    mission = SimpleNamespace(phase=Phase.STANDBY)
+    conditions = StartConditions(cast(AgentSetup, setup), cast(MissionState, mission), Alerts())
+    stands = builders.vehicle_state(landed=Landed.ON_GROUND)
+
+    def waits_for(at_s: float, north_m: float) -> str:
+        other = np.array([north_m, 0.0, -9.0])  # its height is no matter to a vehicle that climbs
+        return conditions.unsettled(round(at_s * SECOND), 0.01, stands, lambda: [other])
+
+    for tenth in range(50):
+        waits_for(tenth / 10.0, 1.0)
+    assert waits_for(5.0, 0.9) == ""
+    assert waits_for(5.1, 0.6) == "0.77 m to the next vehicle (now 0.60 m)"
+    assert waits_for(9.0, 0.9) == "0.77 m to the next vehicle (now 0.90 m)"
+    assert waits_for(9.2, 0.9) == ""
+    mission.phase = Phase.ARM
+    assert waits_for(9.3, 0.6) == "", "that is judged before"

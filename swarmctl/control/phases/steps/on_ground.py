@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from swarmctl.control.phases import handover
 from swarmctl.control.phases.departure import unmet_start_condition
 from swarmctl.control.phases.inputs import PhaseInputs
@@ -16,12 +18,10 @@ def standby(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
         return []
     if inputs.refusal:
         return mission.refuse(inputs.refusal, inputs)
-    phases = {peer.phase for peer in inputs.peers().values() if peer.alive}
-    if Phase.TRACK in phases:  # peers may fly where this vehicle would climb, and its autopilot avoids nobody
-        return mission.refuse("the mission has begun without it", inputs)
-    if phases and max(phases) > Phase.TRACK:
-        return mission.refuse("a peer gave up before take-off", inputs)
-    mission.waits_for = unmet_start_condition(inputs, state, mission.peers - inputs.excused)
+    if too_late := _too_late(peer.phase for peer in inputs.peers().values() if peer.alive):
+        return mission.refuse(too_late, inputs)
+    peers, top_ned_m = mission.peers - inputs.excused, mission.climb.rest_ned_m(state)
+    mission.waits_for = unmet_start_condition(inputs, state, peers, top_ned_m)
     if not mission.waits_for:
         mission.climb.begin(state)
         mission.airborne = state.landed is Landed.IN_AIR
@@ -43,11 +43,20 @@ def arm(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list
     if state.armed:
         mission.enter(Phase.GOTO_START if mission.airborne else Phase.TAKEOFF, inputs.now_us)
         return []
-    if inputs.refusal:
-        return mission.refuse(inputs.refusal, inputs)
+    too_late = "" if mission.airborne else _too_late(peer.phase for peer in inputs.peers().values())
+    if refusal := inputs.refusal or too_late:
+        return mission.refuse(refusal, inputs)
     if not mission.may_request(inputs):
         return []
     if inputs.arm_in not in (None, state.mode):
         return [Command(verb=Verb.EXTERNAL)]
     mission.arming.request()
     return [Command(verb=Verb.ARM)]
+
+
+def _too_late(peers: Iterable[Phase]) -> str:
+    """Return why a vehicle stays on the ground, by the phases of its peers, or ""."""
+    phases = set(peers)
+    if Phase.TRACK in phases:  # peers may fly where this vehicle would climb, and its autopilot avoids nobody
+        return "the mission has begun without it"
+    return "a peer gave up before take-off" if phases and max(phases) > Phase.TRACK else ""
