@@ -194,7 +194,7 @@ class Lockstep:
         """End an agent's process: no more setpoints, its bus session closes, and the others are told as by a launch."""
         self.agents[index] = None
         self.hub.detach(agent_name(index))
-        self.command(EXCLUDE, peer=index)
+        self._say(topics.ENDED, EXCLUDE, peer=index)
 
     def recover(self, index: int) -> None:
         """End an agent's process and start another that only lands its vehicle, as a launch does with a frozen one."""
@@ -205,8 +205,11 @@ class Lockstep:
 
     def command(self, verb: str, agent: int = -1, **arguments: float) -> None:
         """Send an operator's order, as a verb does."""
+        self._say(topics.COMMAND, verb, agent, **arguments)
+
+    def _say(self, topic: topics.Topic, verb: str, agent: int = -1, **arguments: float) -> None:
         message = CommandMessage(verb, agent, self.clock.utc_us(), arguments)
-        self._operator.publish(topics.COMMAND, encode_message(message))
+        self._operator.publish(topic, encode_message(message))
 
     def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Replace the obstacle list by obstacles that are at their centres now, as an operator's verb does."""

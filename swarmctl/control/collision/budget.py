@@ -60,10 +60,12 @@ class SeparationBudget:
     def standing_m(self, accuracy_m: float) -> float:
         """Return the least level distance at which vehicles may stand that are to take off, by their estimates.
 
-        Plans come no closer than `certify_slack_m` below `radius_m`; two estimates of rms `accuracy_m` may be off by
-        twice the rms of their difference.
+        Autopilots climb straight up, so what is required of a radius is enough here. Starts that are `radius_m` apart
+        must not be waited for because estimates of rms `accuracy_m` are.
         """
-        return self.radius_m - self.certify_slack_m - 2.0 * math.sqrt(2.0) * accuracy_m
+        return min(
+            self.required_m(accuracy_m), self.radius_m - self.certify_slack_m - 2.0 * math.sqrt(2.0) * accuracy_m
+        )
 
     # -- hard minimum distances of plans ------------------------------------------------------------------------------
 

@@ -43,13 +43,13 @@ def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_w
 
     def waits_for(at_s: float, north_m: float) -> str:
         other = np.array([north_m, 0.0, -9.0])  # its height is no matter to a vehicle that climbs
-        return conditions.unsettled(round(at_s * SECOND), 0.01, stands, lambda: [other])
+        return conditions.unsettled(round(at_s * SECOND), 0.05, stands, lambda: [other])
 
     for tenth in range(50):
         waits_for(tenth / 10.0, 1.0)
     assert waits_for(5.0, 0.9) == ""
-    assert waits_for(5.1, 0.6) == "0.77 m to the next vehicle (now 0.60 m)"
-    assert waits_for(9.0, 0.9) == "0.77 m to the next vehicle (now 0.90 m)"
+    assert waits_for(5.1, 0.4) == "0.62 m to the next vehicle (now 0.40 m)"
+    assert waits_for(9.0, 0.9) == "0.62 m to the next vehicle (now 0.90 m)"
     assert waits_for(9.2, 0.9) == ""
     mission.phase = Phase.ARM
-    assert waits_for(9.3, 0.6) == "", "that is judged before"
+    assert waits_for(9.3, 0.4) == "", "that is judged before"
