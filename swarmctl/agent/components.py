@@ -187,6 +187,7 @@ def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
         agent=setup.agent,
         peers=len(setup.peers),
         landing_m=budget.landing_m(setup.params.state_machine.apart_m),
+        home_m=budget.home_m,
         start_ned_m=setup.starts_ned_m[setup.agent],
         duration_s=setup.mission.duration_s,
         reference=reference,

@@ -35,6 +35,7 @@ class Flight:
             agent=0,
             peers=peers,
             landing_m=RADIUS_M + told.apart_m,
+            home_m=2.0 / 3.0 * RADIUS_M,
             start_ned_m=START,
             duration_s=DURATION_S,
             reference=mission,

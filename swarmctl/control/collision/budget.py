@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 _MAX_SLACK_01 = 1.0 / 3.0  # share of the distance beyond touching bodies that slack of commitments may use up
+_HOME_01 = 2.0 / 3.0  # share of the radius that is left between starts when estimates have wandered
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,6 +118,14 @@ class SeparationBudget:
     def landing_m(self, margin_m: float) -> float:
         """Return the level distance to others at which a vehicle may land in place."""
         return self.radius_m + margin_m
+
+    @property
+    def home_m(self) -> float:
+        """Return the level distance to others at which a vehicle lands at its start.
+
+        Starts are `radius_m` apart or more. Estimates of vehicles that have landed wander on, so most of it must do.
+        """
+        return max(self.body_m + self.tracking_m, _HOME_01 * self.radius_m)
 
     # -- margins ------------------------------------------------------------------------------------------------------
 

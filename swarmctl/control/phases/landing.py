@@ -28,6 +28,7 @@ class Landing:
         params: tolerances.
         agent: index of this agent.
         apart_m: level distance to others at which it may land in place.
+        home_apart_m: the same at its start position.
         start_ned_m: (3,) start position, the landing place unless the agent lands in place.
         trajectories: set to the ways there.
         volume: to stay in; None for none.
@@ -40,16 +41,15 @@ class Landing:
         self,
         params: StateMachineParams,
         agent: int,
-        apart_m: float,
         *,
+        apart_m: float,
+        home_apart_m: float,
         start_ned_m: Array,
         trajectories: Trajectories,
         volume: FlightVolume | None,
     ) -> None:
-        self._params, self._agent, self._apart_m = params, agent, apart_m
+        self._params, self._agent, self._apart_m, self._home_apart_m = params, agent, apart_m, home_apart_m
         self._start_ned_m, self._trajectories, self._volume = start_ned_m, trajectories, volume
-        # Neighbouring start positions may be as near as distances allow, and each is reached with a tolerance.
-        self._home_apart_m = apart_m - params.apart_m - 2.0 * params.land_m
         self.in_place = False
         self._beside = False  # its landing place is beside the start position, which an obstacle takes
 

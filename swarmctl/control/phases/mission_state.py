@@ -39,6 +39,7 @@ class MissionSetup:
     agent: int  # index of this agent
     peers: int  # number of the other agents
     landing_m: float  # level distance to others at which it may land in place
+    home_m: float  # the same at the start position
     start_ned_m: Array  # (3,) start position, also the landing place
     duration_s: float  # of the tracked mission
     reference: MissionReference  # of the tracked mission
@@ -100,7 +101,8 @@ class MissionState:
         self.landing = Landing(
             params,
             setup.agent,
-            setup.landing_m,
+            apart_m=setup.landing_m,
+            home_apart_m=setup.home_m,
             start_ned_m=setup.start_ned_m,
             trajectories=self.trajectories,
             volume=setup.volume,
