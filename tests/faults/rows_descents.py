@@ -5,7 +5,6 @@ from __future__ import annotations
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.sharing.path_publisher import PathPublisher
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import Landed
 from tests.closed_loop.conftest import COARSE
 from tests.faults.row import Off
 from tests.faults.rows_agents import lands
@@ -67,11 +66,6 @@ def lands_over_ball(scene: Scene) -> None:
     scene.lockstep.command("land")
 
 
-def is_down(scene: Scene) -> bool:
-    vehicle = scene.true(_OVER)
-    return bool(vehicle["landed"] == Landed.ON_GROUND and not vehicle["armed"])
-
-
 def is_clear_of_ball(scene: Scene) -> bool:
     return BALL.distance_m(scene.true(_OVER)["pos_ned_m"]) >= BALL.keep_out_m - scene.config.limits.obstacle_margin_m
 
@@ -86,7 +80,7 @@ def _over_ball(name: str, event: str, happens: Happens, told: tuple[str, ...] = 
         protection="a landing place has room from obstacles at rest, down to the ground",
         due=tracking(1.0),
         happens=happens,
-        reacts=is_down,
+        reacts=lambda scene: scene.stands(_OVER),
         lasts_s=25.5,
         always={"it is in the obstacle's keep-out": is_clear_of_ball},
         told=told,

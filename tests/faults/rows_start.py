@@ -9,7 +9,7 @@ from swarmctl.agent.sensing import world_model
 from swarmctl.control.phases import departure, landing
 from swarmctl.control.phases.steps import on_ground
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import Landed, Phase
+from swarmctl.core.types import Phase
 from tests.closed_loop.conftest import COARSE
 from tests.faults.row import Off
 from tests.faults.rows_agents import frozen
@@ -28,11 +28,6 @@ OVER_FIRST = Obstacle(center_ned_m=(3.0, 0.1, -1.5), radius_m=0.5, keep_out_m=1.
 FIRST = 0
 _HOLDS_AFTER_S, _RETURNS_AFTER_S = 8.0, 10.0
 _PX4_CUSTOM_MODE, _AUTO, _AUTO_LOITER = 1.0, 4.0, 3.0
-
-
-def stands(scene: Scene, agent: int) -> bool:
-    vehicle = scene.true(agent)
-    return bool(vehicle["landed"] == Landed.ON_GROUND and not vehicle["armed"])
 
 
 def takes_the_place(scene: Scene) -> None:
@@ -66,7 +61,7 @@ ROWS = (
         protection="a start over which another vehicle is, at whatever height, is no landing place (Landing)",
         due=tracking(2.0),
         happens=takes_the_place,
-        reacts=lambda scene: stands(scene, FIRST),
+        reacts=lambda scene: scene.stands(FIRST),
         lasts_s=60.5,
         may_be_told=("pilot or autopilot took over", "stopped by the operator"),
         off=Off(patches=((landing, "nearest_in_plane_m", lambda *_: math.inf),)),
@@ -80,9 +75,9 @@ ROWS = (
         protection="nobody is armed once a peer has given up, or begun the mission",
         due=lambda scene: scene.phase(VICTIM) is Phase.ARM,
         happens=is_late,
-        reacts=lambda scene: scene.phase(VICTIM) is Phase.DONE and stands(scene, VICTIM),
+        reacts=lambda scene: scene.phase(VICTIM) is Phase.DONE and scene.stands(VICTIM),
         lasts_s=62.0,
-        always={"it has taken off": lambda scene: stands(scene, VICTIM)},
+        always={"it has taken off": lambda scene: scene.stands(VICTIM)},
         may_be_told=("gave up", "stopped by the operator"),
         off=Off(patches=((on_ground, "_too_late", lambda _: ""),)),
     ),
@@ -97,7 +92,7 @@ ROWS = (
         happens=lambda scene: scene.lockstep.set_obstacles([OVER_FIRST]),
         reacts=lambda scene: "obstacle" in scene.alert(FIRST),
         lasts_s=20.0,
-        always={"it flies into the obstacle": lambda scene: stands(scene, FIRST)},
+        always={"it flies into the obstacle": lambda scene: scene.stands(FIRST)},
         off=Off(patches=((departure, "_obstacle_over", lambda *_: ""),)),
     ),
     SimulatedRow(
@@ -109,7 +104,7 @@ ROWS = (
         protection="the safety filter does not drive away from a silent peer (not_driving_away_m)",
         due=lambda scene: scene.phase(VICTIM) is Phase.TAKEOFF and scene.true(VICTIM)["pos_ned_m"][2] < 1.0,
         happens=frozen(math.inf),
-        reacts=lambda scene: stands(scene, VICTIM),
+        reacts=lambda scene: scene.stands(VICTIM),
         lasts_s=17.0,
         apart_m=0.85,
         may_be_told=(".",),

@@ -18,7 +18,7 @@ from swarmctl.agent.agent import Agent
 from swarmctl.config import Config, dump, load
 from swarmctl.core.clock import ClockError
 from swarmctl.core.closest_pair import closest_pair_m
-from swarmctl.core.types import FlightMode, Mode, Phase
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.simulator_config import FaultParams
 from swarmctl.telemetry.recording import run_folder
 from tests.closed_loop.conftest import COARSE, mission_t_s
@@ -87,6 +87,11 @@ class Scene:
     def true(self, i: int) -> Any:
         """True state of a vehicle."""
         return self.lockstep.world.truth_rows()[i]
+
+    def stands(self, i: int) -> bool:
+        """Whether a vehicle is on the ground and disarmed."""
+        vehicle = self.true(i)
+        return bool(vehicle["landed"] == Landed.ON_GROUND and not vehicle["armed"])
 
     def speed_m_s(self, i: int) -> float:
         return float(np.linalg.norm(self.true(i)["vel_ned_m_s"]))

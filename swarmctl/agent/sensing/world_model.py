@@ -113,7 +113,7 @@ class WorldModel:
         if order is None:
             return None
         if order.verb == EXCLUDE and order.arguments[PEER] in self._vouchers.get(sender, ()):
-            self.exclude(int(order.arguments[PEER]))
+            self.exclude(int(order.arguments[PEER]))  # at once: no `life_sign` speaks against who runs the process
             return order
         self.refusals.add(sender, topics.ENDED.name, IDENTITY, utc_us)
         return None

@@ -51,6 +51,8 @@ class PlanBuffer:
             self.plan = plan
             return
         kept = self.plan
+        if kept is None and not self._takes_refused:
+            return
         replayed_m = -math.inf if kept is None else certify(self.positions_ned_m(kept, start.t_us), keep_outs, 0)
         if replayed_m >= 0.0:
             return

@@ -39,11 +39,11 @@ def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[i
 
 def _obstacle_over(inputs: PhaseInputs, top_ned_m: Array) -> str:
     """Return which obstacle has to go before the autopilot, which avoids none, can climb to (3,), or ""."""
-    for obstacle in inputs.obstacles(top_ned_m):
-        apart_m = obstacle.descent_distance_m(top_ned_m)
-        if apart_m < obstacle.keep_out_m:
-            return f"an obstacle {apart_m:.2f} m beside its climb to go (keep_out_m = {obstacle.keep_out_m:g})"
-    return ""
+    obstacle = inputs.obstacle_below(top_ned_m, top_ned_m)
+    if obstacle is None:
+        return ""
+    apart_m = obstacle.descent_distance_m(top_ned_m)
+    return f"an obstacle {apart_m:.2f} m beside its climb to go (keep_out_m = {obstacle.keep_out_m:g})"
 
 
 def names_of(agents: Iterable[int]) -> str:

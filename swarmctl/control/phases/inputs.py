@@ -45,3 +45,8 @@ class PhaseInputs:
     escalation: Escalation = NOTHING_WORN  # response to what wears out: battery, link
     setpoints_stopped: str = ""  # by missed deadlines a moment ago, in words
     armed_told_us: int = -1  # arrival time of the HEARTBEAT that reported `state.armed`
+
+    def obstacle_below(self, place_ned_m: Array, seen_from_ned_m: Array) -> Obstacle | None:
+        """Return an obstacle, known at a position (3,), whose keep-out is on the vertical down from a place (3,)."""
+        known = self.obstacles(seen_from_ned_m)
+        return next((o for o in known if o.descent_distance_m(place_ned_m) < o.keep_out_m), None)

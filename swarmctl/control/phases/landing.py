@@ -98,7 +98,7 @@ class Landing:
         Where no place is, the way to the one with most room is flown to its end before another is looked for.
         """
         target_ned_m = begun.trajectory.to_ned_m
-        if controls and not self._is_clear(inputs, state, target_ned_m):
+        if controls and inputs.obstacle_below(target_ned_m, state.pos_ned_m) is not None:
             if self._beside and _is_under_way(begun, inputs.now_us):
                 return False
             self._beside = True
@@ -126,11 +126,7 @@ class Landing:
         if not controls:
             return True
         apart = nearest_in_plane_m(state.pos_ned_m, inputs.others_ned_m()) >= self._apart_m
-        return apart and self._is_clear(inputs, state, state.pos_ned_m)
-
-    def _is_clear(self, inputs: PhaseInputs, state: VehicleState, place_ned_m: Array) -> bool:
-        """Return whether no known obstacle's keep-out is on the way down from a place (3,)."""
-        return all(o.descent_distance_m(place_ned_m) >= o.keep_out_m for o in inputs.obstacles(state.pos_ned_m))
+        return apart and inputs.obstacle_below(state.pos_ned_m, state.pos_ned_m) is None
 
 
 def _is_under_way(begun: BegunTrajectory, now_us: int) -> bool:
