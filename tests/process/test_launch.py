@@ -117,10 +117,10 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start, tmp
     assert "the vehicle of agent-1 is on the ground and disarmed" in launched.text()
     were = launched.events("parameters_changed", "agent-1")[0]["were"]
     assert (were["NAV_DLL_ACT"], were["MIS_TAKEOFF_ALT"]) == (0, 2.5)
-    told = values_told(launched.run_dir / "recovery" / "agent-1.tlog", "NAV_DLL_ACT")
-    assert (told[0] != 0, told[-1]) == (True, 0), "set for the flight, and by the other agent to what it was before"
-    told = values_told(launched.run_dir / "recovery" / "agent-1.tlog", "MIS_TAKEOFF_ALT")
-    assert (told[0] != 2.5, told[-1]) == (True, 2.5), "set by the climb"
+    for name, was in (("NAV_DLL_ACT", 0), ("MIS_TAKEOFF_ALT", 2.5)):
+        killed, after = (values_told(launched.run_dir / it / "agent-1.tlog", name) for it in (".", "recovery"))
+        assert (killed[0], killed[-1] != was) == (was, True), "set for the flight, or by the climb"
+        assert after[-1] == was, "set back by the other agent, also where the vehicle has landed before it came"
     summary = launched.summary()
     assert summary["outcome"] == "failed"
     assert any("agent-1" in violation for violation in summary["violations"])
