@@ -311,6 +311,7 @@ class Agent:
             self._ports.commands.request(command)
         if mission.pilot_override:
             self._alerts.put("override", mission.outcome, now_us)
+        self._start_conditions.compare_heights(now_us, state, self._world_model.standing_m)
         self._start_conditions.report(now_us)
         self._mission_end.step(now_us)
         self._vehicle_setup.step(now_us)

@@ -212,7 +212,7 @@ def _heights(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
     if len(placed) < 2:
         return []
     (highest_m, i), (lowest_m, j) = min(placed), max(placed)
-    apart_m, noted_m = lowest_m - highest_m, 0.5 * config.separation.radius_m
+    apart_m, noted_m = lowest_m - highest_m, config.separation.budget.level_m
 
     def line(verdict: Verdict, advice: str = "", weight: int = 0) -> list[Finding]:
         return [

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
+from swarmctl.bus.bus import agent_name
 from swarmctl.control.collision.separation import radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
 from swarmctl.control.phases.mission_state import MissionState
@@ -22,7 +23,7 @@ class StartConditions:
     Args:
         setup: the distances that the accuracy has to suffice for.
         mission: phase, and what it waits for.
-        alerts: are told what it waits for.
+        alerts: are told what it waits for, and of heights that differ.
     """
 
     def __init__(self, setup: AgentSetup, mission: MissionState, alerts: Alerts) -> None:
@@ -63,6 +64,28 @@ class StartConditions:
             self._close_us = now_us
         is_close = self._close_us is not None and now_us - self._close_us < _APART_FOR_US
         return f"{least_m:.2f} m to the next vehicle (now {nearest_m:.2f} m)" if is_close else ""
+
+    def compare_heights(
+        self, now_us: int, state: VehicleState | None, standing_m: Callable[[], Mapping[int, float]]
+    ) -> None:
+        """Raise an alert where a vehicle estimates to stand far above or below another one.
+
+        On level ground one of the estimates is wrong, and stays so in flight; on a slope none is. So both may fly.
+
+        Args:
+            now_us: monotonic time.
+            state: newest one.
+            standing_m: returns the height [m] of each peer's vehicle that stands, by agent number.
+        """
+        if self._mission.phase > Phase.STANDBY or state is None or state.landed is not Landed.ON_GROUND:
+            return
+        apart_m = {agent: -float(state.pos_ned_m[2]) - its_m for agent, its_m in standing_m().items()}
+        agent = max(apart_m, key=lambda it: abs(apart_m[it]), default=-1)
+        if agent < 0 or abs(apart_m[agent]) <= self._setup.separation.budget.level_m:
+            return
+        where = f"{abs(apart_m[agent]):.1f} m {'above' if apart_m[agent] > 0.0 else 'below'} {agent_name(agent)}"
+        text = f"estimates to stand {where}: if it does not, they meet where they mean to pass above each other"
+        self._alerts.put("heights", text, now_us)
 
     def report(self, now_us: int) -> None:
         """Raise the unmet condition as an alert once the agent has waited for a while; clear it once it is met."""

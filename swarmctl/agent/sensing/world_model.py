@@ -360,6 +360,14 @@ class WorldModel:
         paths = self.paths.latest()
         return tuple(aligned(paths, utc_us, 1, 0, brake_m_s2=self._params.brake_m_s2)[:, 0]) if paths else ()
 
+    def standing_m(self) -> dict[int, float]:
+        """Return the heights [m] above the shared origin at which peers' vehicles stand, as their agents have said."""
+        return {
+            agent: status.altitude_m
+            for agent, status in self._status.items()
+            if status.landed == Landed.ON_GROUND and not status.armed and status.ground_speed_m_s >= 0.0
+        }
+
     def has_unresponsive_peer(self, utc_us: int) -> bool:
         """Return whether some peer is silent and not known to have died: it may be flying on, or our bus is lost.
 

@@ -68,6 +68,14 @@ class SeparationBudget:
             self.required_m(accuracy_m), self.radius_m - self.certify_slack_m - 2.0 * math.sqrt(2.0) * accuracy_m
         )
 
+    @property
+    def level_m(self) -> float:
+        """Return the difference in height between vehicles on the ground above which an operator is told of it.
+
+        Vehicles that estimate false heights pass above each other by their estimates alone.
+        """
+        return 0.5 * self.radius_m
+
     # -- hard minimum distances of plans ------------------------------------------------------------------------------
 
     @property

@@ -35,6 +35,27 @@ def test_an_agent_that_waits_no_longer_does_not_say_so(phase: Phase, waits_for: 
     assert alerts.newest(5 * SECOND) is None
 
 
+@pytest.mark.parametrize(
+    ("phase", "others_m", "said"),
+    [
+        (Phase.STANDBY, {1: 5.4, 2: 4.6}, ""),
+        (Phase.STANDBY, {1: 5.4, 2: 4.4}, "estimates to stand 0.6 m above agent-2: "),
+        (Phase.STANDBY, {1: 7.0, 2: 4.4}, "estimates to stand 2.0 m below agent-1: "),
+        (Phase.TAKEOFF, {1: 7.0}, ""),
+        (Phase.STANDBY, {}, ""),
+    ],
+)
+def test_who_stands_at_another_height_than_a_peer_says_so(phase: Phase, others_m: dict[int, float], said: str) -> None:
+    setup, alerts = SimpleNamespace(separation=SeparationParams()), Alerts()
+    mission = SimpleNamespace(phase=phase)
+    conditions = StartConditions(cast(AgentSetup, setup), cast(MissionState, mission), alerts)
+    stands = builders.vehicle_state(landed=Landed.ON_GROUND, pos_ned_m=np.array([0.0, 0.0, -5.0]))
+    conditions.compare_heights(0, stands, lambda: others_m)
+    alert = alerts.newest(0)
+    assert (alert is not None) == bool(said)
+    assert alert is None or alert.text.startswith(said)
+
+
 def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_while() -> None:
     setup = SimpleNamespace(starts_ned_m=np.zeros((2, 3)), separation=SeparationParams(), drift_m=0.0)
     mission = SimpleNamespace(phase=Phase.STANDBY)
