@@ -8,7 +8,8 @@ A position that no flight can explain is bridged: the difference is subtracted, 
 no agent flies across the difference. A newly reported origin explains the difference and ends the bridge. Otherwise the
 vehicle may be at either place, and `margin_m` is the extra distance to keep from it. A short bridge is drawn in slowly
 once positions have been steady. A long bridge stays until the estimate jumps back or the vehicle has landed: which
-place is right can't be known, and to continue as before endangers no vehicle that was safe.
+place is right can't be known, and to continue as before endangers no vehicle that was safe. For the same reason the
+margin outlasts a bridge that was drawn in, unless the estimator itself reports that it has corrected its position.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ class LocalFrame:
     Attributes:
         offset_ned_m: (3,) local origin in the shared frame; None while unknown.
         bridge_ned_m: (3,) correction added to positions since the newest jump.
+        drawn_ned_m: (3,) what has been drawn in of bridges over jumps that the estimator itself has not reported.
         margin_m: distance by which the vehicle may be away from its reported position, because of a jump.
         jump_m: size of the newest jump.
         invalid: number of positions that were not believed, by reason.
@@ -55,7 +57,9 @@ class LocalFrame:
     """
 
     bridge_ned_m: Array
+    drawn_ned_m: Array
     margin_m: float
+    _is_reset: bool  # the estimator itself has reported the newest jump
     _unexplained: bool  # bridged, and not yet known whether the origin has moved
     _jumped_us: int
 
@@ -144,7 +148,7 @@ class LocalFrame:
                 return
         if missed_m < leeway_m:
             return
-        self.bridge_ned_m, self._jumped_us = missing_ned_m, t_us
+        self.bridge_ned_m, self._jumped_us, self._is_reset = missing_ned_m, t_us, reset
         self.jump_m = math.sqrt(float(missing_ned_m @ missing_ned_m))
         self._unexplained = not reset and self.jump_m >= step_m  # otherwise it has jumped back
         self.jumps += reset
@@ -156,11 +160,16 @@ class LocalFrame:
         if self._unexplained and t_us - self._jumped_us > _ASKED_US:  # no moved origin has been reported
             self._unexplained = False
             self.jumps += 1
-        wanted_m = min(self.jump_m, MAX_MARGIN_M) if left_m and not self._unexplained else 0.0
+        doubted_m = self.jump_m if left_m else 0.0
+        if self.drawn_ned_m is not _NOTHING:
+            doubted_m = math.dist((bridge_ned_m + self.drawn_ned_m).tolist(), (0.0, 0.0, 0.0))
+        wanted_m = 0.0 if self._unexplained or doubted_m < _SAME_M else min(doubted_m, MAX_MARGIN_M)
         widest_m, least_m = self.margin_m + _WIDEN_M_S * since_s, self.margin_m - _NARROW_M_S * since_s
         self.margin_m = max(min(wanted_m, widest_m), least_m)
         if left_m and self.jump_m <= _SHORT_M and t_us - self._jumped_us > _STEADY_US:
             self.bridge_ned_m = bridge_ned_m * max(0.0, 1.0 - _DRAW_IN_M_S * since_s / left_m)
+            if not self._is_reset:
+                self.drawn_ned_m = self.drawn_ned_m + bridge_ned_m - self.bridge_ned_m
 
     def _take_origin(self) -> None:
         """Adopt a moved origin: positions have moved with it, and there was no jump."""
@@ -169,8 +178,8 @@ class LocalFrame:
             self.bridge_ned_m, self._unexplained = _NOTHING, False
 
     def _settle(self) -> None:
-        self.bridge_ned_m, self.margin_m = _NOTHING, 0.0
-        self._unexplained, self._jumped_us = False, 0
+        self.bridge_ned_m, self.drawn_ned_m, self.margin_m = _NOTHING, _NOTHING, 0.0
+        self._is_reset, self._unexplained, self._jumped_us = False, False, 0
 
     def _in_shared(self, place: GeoOrigin) -> Array:
         shared = self._shared

@@ -135,7 +135,32 @@ def test_a_short_jump_of_the_estimate_is_drawn_in_slowly_once_positions_are_stea
     placed += vehicle.fly(1.0)
     assert vehicle.error_m(placed) < 0.02
     assert max(steps_m(placed)) <= 0.3 * STEP_US * 1e-6 + 1e-6
+    vehicle.fly(30.0)
+    assert vehicle.frame.margin_m == pytest.approx(0.8, abs=0.02), "nobody has said which place was the right one"
+    vehicle.armed = False
+    vehicle.fly(0.1)
+    assert vehicle.frame.margin_m == 0.0
+
+
+def test_margins_of_jumps_that_were_drawn_in_add_up() -> None:
+    vehicle = jumped(flying(), 0.1 * UP)
+    vehicle.fly(8.0)
+    jumped(vehicle, np.array([0.5, 0.0, 0.0])).fly(8.0)
+    assert vehicle.frame.margin_m == pytest.approx(0.71, abs=0.02)
+    jumped(vehicle, -0.1 * UP).fly(8.0)
+    assert vehicle.frame.margin_m == pytest.approx(0.5, abs=0.02)
+
+
+def test_the_margin_ends_where_the_estimator_tells_that_it_has_corrected_itself() -> None:
+    vehicle = flying()
+    vehicle.fly(0.02)
+    jumped(vehicle, 0.1 * UP)
+    vehicle.t_us += STEP_US
+    vehicle.true = vehicle.true + EAST * STEP_US * 1e-6
+    vehicle.frame.place(vehicle.t_us, vehicle.true - vehicle.origin, EAST, True, reset=True)
     vehicle.fly(2.0)
+    assert vehicle.frame.margin_m == pytest.approx(0.5, abs=0.02)
+    assert vehicle.error_m(vehicle.fly(8.0)) < 0.02
     assert vehicle.frame.margin_m == 0.0
 
 
