@@ -74,10 +74,16 @@ class Trajectory:
         return 1e-6 * self.clock_error_us * math.sqrt(float(np.einsum("kc,kc->k", vel, vel).max()))
 
     def acceleration(self, t_utc_us: float) -> Array:
-        """Return the acceleration (3,) NED [m/s2] at a time, by central difference of velocities."""
+        """Return the acceleration (3,) NED [m/s2] at a time, by the difference of velocities up to half a step away.
+
+        One that begins in motion is not at rest before: its vehicle has moved at the velocity at which it begins.
+        """
         half_us = 0.5 * self.dt_us
-        vel = self.sample(np.array([t_utc_us - half_us, t_utc_us + half_us]))[1]
-        return np.asarray((vel[1] - vel[0]) / (self.dt_us * 1e-6))
+        since_us, until_us = max(t_utc_us - half_us, self.t0_utc_us), min(t_utc_us + half_us, self.end_utc_us)
+        if until_us <= since_us:
+            return np.zeros(3)
+        vel = self.sample(np.array([since_us, until_us]))[1]
+        return np.asarray((vel[1] - vel[0]) / ((until_us - since_us) * 1e-6))
 
 
 def positions_at(trajectories: Sequence[Trajectory], t_utc_us: Times) -> Array:

@@ -220,6 +220,16 @@ def test_a_trajectory_rests_before_and_after_itself_and_is_smooth_between() -> N
     )
 
 
+def test_a_trajectory_that_begins_in_motion_was_not_at_rest_before() -> None:
+    """Its vehicle has not been accelerated to its first velocity within the step before."""
+    path = trajectory()
+    braking_m_s2 = -1.5 * path.vel_ned_m_s[0] / np.linalg.norm(path.vel_ned_m_s[0])
+    for after_us in (0, 20_000, 40_000, 60_000):
+        np.testing.assert_allclose(path.acceleration(UTC_US + after_us), braking_m_s2, atol=0.05)
+    assert not path.acceleration(UTC_US - 100_000).any()
+    assert not path.acceleration(path.end_utc_us + 100_000).any()
+
+
 def test_a_proposal_leaves_the_committed_trajectory_and_ends_at_rest() -> None:
     first = trajectory()
     branch_us = UTC_US + 237_000
