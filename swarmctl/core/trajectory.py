@@ -190,12 +190,16 @@ def delayed(trajectory: Trajectory, by_us: int) -> Trajectory:
 
 
 def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
-    """Return `first` from a time on, continued by `then` where that begins, on the grid of `then`."""
+    """Return `first` from a time on, continued by `then` where that begins, on the grid of `then`.
+
+    A point of that grid before the begin of `first` lies where its vehicle was at the velocity at which it begins.
+    """
     missing = max(0, math.ceil((then.t0_utc_us - from_utc_us) / then.dt_us))
     if missing == 0:
         return then
     times = then.t0_utc_us - np.arange(missing, 0, -1) * then.dt_us
-    pos, vel = first.sample(times)
+    pos, vel = first.sample(np.maximum(times, first.t0_utc_us))
+    pos -= 1e-6 * np.maximum(first.t0_utc_us - times, 0)[:, None] * vel
     return Trajectory(
         t0_utc_us=int(times[0]),
         dt_us=then.dt_us,

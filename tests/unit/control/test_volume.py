@@ -253,7 +253,7 @@ def test_an_agent_that_is_blown_out_commits_to_come_back() -> None:
 
 
 @pytest.mark.parametrize(
-    ("volume", "from_m", "is_inside"), [(VOLUME, 1.9, True), (None, 1.9, False), (VOLUME, 1.3, False)]
+    ("volume", "from_m", "is_inside"), [(VOLUME, 1.9, True), (None, 1.9, False), (VOLUME, 1.1, False)]
 )
 def test_an_evasion_stays_inside_only_where_one_that_does_is_clear(
     volume: FlightVolume | None, from_m: float, is_inside: bool

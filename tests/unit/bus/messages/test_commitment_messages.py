@@ -243,6 +243,16 @@ def test_a_proposal_leaves_the_committed_trajectory_and_ends_at_rest() -> None:
     assert joined(resting(pos[0], UTC_US, 100_000), replace(then), branch_us).t0_utc_us == branch_us
 
 
+def test_a_proposal_just_after_the_begin_goes_on_as_the_vehicle_moves() -> None:
+    first = trajectory()
+    branch_us = UTC_US + 60_000
+    pos, vel = first.sample(branch_us + np.arange(5) * 100_000)
+    whole = joined(first, ending_at_rest(branch_us, 100_000, pos, vel, brake_m_s2=1.5), UTC_US)
+    until_then = np.arange(UTC_US, branch_us, 5_000)
+    np.testing.assert_allclose(whole.sample(until_then)[0], first.sample(until_then)[0], atol=2e-3)
+    np.testing.assert_allclose(whole.sample(until_then)[1], first.sample(until_then)[1], atol=0.1)
+
+
 def test_sampling_one_time_equals_sampling_many() -> None:
     path = trajectory()
     for t_us in np.arange(UTC_US - 200_000, path.end_utc_us + 300_000, 7_001):
