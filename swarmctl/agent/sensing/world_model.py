@@ -24,6 +24,7 @@ from swarmctl.control.collision.separation import (
     keep_out_of_obstacle,
     not_driving_away_m,
 )
+from swarmctl.control.estimation.constant_velocity import CREEP_M_S
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Answer, Order
@@ -37,7 +38,8 @@ _RECENT_PATH_US = 300_000  # largest age of a path that is compared with commitm
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 _STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
 _DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
-_MOVES = frozenset(FlightMode) - {FlightMode.HOLD}
+_HOLDS = frozenset((FlightMode.HOLD,))
+_MOVES = frozenset(FlightMode) - _HOLDS
 FLOWN_BY_AGENT = frozenset((Mode.TRACKING, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
 
@@ -397,9 +399,13 @@ class WorldModel:
     def _is_parked(self, agent: int) -> bool:
         """Return whether a peer's mission has ended and its vehicle stays where it is: on the ground, or in a hold.
 
-        An agent that was restarted in flight is done at once, while the autopilot still lands its vehicle.
+        An agent that was restarted in flight is done at once, while the autopilot still lands its vehicle. One that
+        was handed back in a hold may be moved in it.
         """
-        return self._is_in(agent, Phase.DONE) and not self._flies_in(agent, _MOVES)
+        status = self._status.get(agent)
+        if status is None or status.phase != Phase.DONE or self._flies_in(agent, _MOVES):
+            return False
+        return status.ground_speed_m_s < CREEP_M_S or not self._flies_in(agent, _HOLDS)
 
     def _is_landing(self, agent: int) -> bool:
         """Return whether a peer's vehicle descends, by its agent's order, a pilot's, or by itself."""

@@ -10,7 +10,7 @@ from swarmctl.agent.sharing.path_sharing import PathSharing
 from swarmctl.bus import topics
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.control.controllers.kind import Controller
-from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
+from swarmctl.control.estimation.constant_velocity import StopJudge, predict_constant_velocity
 from swarmctl.control.estimation.gust import GustWatch
 from swarmctl.core.trajectory import grid
 from swarmctl.core.types import MAX_MARGIN_M, Array, Plan, PredictedPath, VehicleState
@@ -34,7 +34,7 @@ class PathPublisher:
         self._dt_us, self._steps, self._widens_in_gusts = controller.dt_us, controller.steps, widens_in_gusts
         self._max_age_us = round(setup.params.failsafe.state_max_age_s * 1e6)
         self._sharing = PathSharing(setup.params.path_sharing, setup.separation)
-        self._gust = GustWatch()
+        self._gust, self._stop_judge = GustWatch(), StopJudge()
         self._far_due_us = 0  # when the next path is one that all hear
 
     def publish(
@@ -82,11 +82,13 @@ class PathPublisher:
 
     def _path(self, state: VehicleState, flown: Plan | None, seq: int, margin_m: float) -> PredictedPath:
         if flown is not None:
+            self._stop_judge.forget()
             t0_us, dt_us, pos = flown.t0_us, flown.dt_us, flown.pos_ned_m
         else:
+            stops = self._stop_judge.update(state)
             t0_us, dt_us = self._ports.clock.now_us() + self._delay_us, self._dt_us
             ahead_s = grid(self._steps) * (dt_us * 1e-6) + (t0_us - state.t_us) * 1e-6
-            pos = predict_constant_velocity(state, ahead_s, self._setup.separation.brake_m_s2)
+            pos = predict_constant_velocity(state, ahead_s, self._setup.separation.brake_m_s2, stops=stops)
         return PredictedPath(
             agent=self._setup.agent,
             boot_id=self._setup.boot_id,

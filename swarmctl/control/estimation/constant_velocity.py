@@ -1,23 +1,57 @@
-"""Prediction of a vehicle that its autopilot or a pilot flies: constant velocity, or braking in hold and land."""
+"""Prediction of a vehicle that its autopilot or a pilot flies: constant velocity, or braking where it comes to rest."""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 
 from swarmctl.core.types import Array, FlightMode, VehicleState
 
-_STOPS = (FlightMode.HOLD, FlightMode.LAND)  # modes in which an autopilot brakes
+CREEP_M_S = 0.5  # a slower vehicle in hold is taken to rest: estimates of hovering ones wander as fast
+_ENTERS_US = 1_000_000  # time in hold for which it is taken to brake, whatever its speed does
+_WINDOW_US = 400_000  # over which speeds are compared after that
+_BRAKES_M_S = 0.2  # by which the speed of one that brakes falls in that time; PX4 brakes at 3 m/s2
 
 
-def predict_constant_velocity(state: VehicleState, ahead_s: Array, brake_m_s2: float) -> Array:
+def predict_constant_velocity(state: VehicleState, ahead_s: Array, brake_m_s2: float, *, stops: bool) -> Array:
     """Return positions (N, 3), NED [m], at `ahead_s` (N,) after a state.
 
-    The velocity is continued, or reduced at `brake_m_s2` in modes in which the autopilot stops the vehicle.
+    The velocity is continued, or reduced at `brake_m_s2` where the vehicle `stops`.
     """
-    if state.mode in _STOPS:
+    if stops:
         speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
         t_s = np.minimum(ahead_s, speed / brake_m_s2)
         ahead_s = t_s - 0.5 * brake_m_s2 * t_s * t_s / max(speed, 1e-6)  # time to travel as far at the present speed
     return np.asarray(state.pos_ned_m + ahead_s[:, None] * state.vel_ned_m_s)
+
+
+class StopJudge:
+    """Judges whether a vehicle that its agent does not fly comes to rest, from one state to the next.
+
+    Autopilots brake in hold and land. But a ground station moves a vehicle in hold (DO_REPOSITION), and in some holds
+    it follows its pilot's sticks (LOITER of ArduCopter): what does not brake there is not going to stop.
+    """
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[int, float]] = deque()  # time and speed
+        self._held_since_us: int | None = None
+
+    def update(self, state: VehicleState) -> bool:
+        """Take in the newest state; return whether the vehicle stops."""
+        if state.mode is not FlightMode.HOLD:
+            self.forget()
+            return state.mode is FlightMode.LAND
+        t_us, speed_m_s = state.t_us, math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
+        self._held_since_us = t_us if self._held_since_us is None else self._held_since_us
+        self._recent.append((t_us, speed_m_s))
+        while t_us - self._recent[0][0] > _WINDOW_US:
+            self._recent.popleft()
+        brakes = speed_m_s < self._recent[0][1] - _BRAKES_M_S
+        return speed_m_s < CREEP_M_S or brakes or t_us - self._held_since_us < _ENTERS_US
+
+    def forget(self) -> None:
+        """Begin anew: the agent flies the vehicle."""
+        self._recent.clear()
+        self._held_since_us = None

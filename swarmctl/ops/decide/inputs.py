@@ -26,11 +26,11 @@ from swarmctl.bus.messages.json_messages import (
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.bus.topics import OPERATOR, Topic
 from swarmctl.config import Config
-from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
+from swarmctl.control.estimation.constant_velocity import StopJudge, predict_constant_velocity
 from swarmctl.control.model import Predictor
 from swarmctl.control.phases.steps.tracking import BEGIN_DELAY_US
 from swarmctl.core.operator_verbs import MISSION, OPERATOR_VERBS
-from swarmctl.core.types import Array, FlightMode, Landed, Phase, PredictedPath, VehicleState
+from swarmctl.core.types import FlightMode, Landed, Phase, PredictedPath, VehicleState
 from swarmctl.mavlink.commands import OWN_COMPID
 from swarmctl.mavlink.transport import Datagram
 from swarmctl.telemetry.recording.run_files import utc_us_of
@@ -177,14 +177,18 @@ def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np
     times_us, begins = np.unique(points["t_us"], return_index=True)
     planned = dict(zip(times_us.tolist(), np.split(points, begins[1:]), strict=True)) if len(points) else {}
     like = planned[int(times_us[0])]["at_us"] if planned else np.arange(_COAST_POINTS) * round(_COAST_S * 1e6)
-    delay_us = Predictor(config.model_of(peer)).delay_us
+    delay_us, stop_judge = Predictor(config.model_of(peer)).delay_us, StopJudge()
     for row, begin_us in zip(rows, begins_utc_us(rows).tolist(), strict=True):
         t_us, utc_us = int(row["t_us"]), int(row["utc_us"])
         if t_us in planned:
+            stop_judge.forget()
             at_us, pos = planned[t_us]["at_us"], planned[t_us]["pos_ned_m"].astype(np.float64)
         elif np.isfinite(row["pos_ned_m"]).all() and np.isfinite(row["vel_ned_m_s"]).all():
             at_us = t_us + delay_us + like - like[0]
-            pos = _straight_on(row, at_us, config.separation.brake_m_s2)
+            state = _state(row)
+            ahead_s = (at_us - state.t_us).astype(np.float64) * 1e-6
+            stops = stop_judge.update(state)
+            pos = predict_constant_velocity(state, ahead_s, config.separation.brake_m_s2, stops=stops)
         else:
             continue
         path = PredictedPath(
@@ -200,10 +204,10 @@ def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np
         yield utc_us, topics.PATH, agent_name(peer), encoded
 
 
-def _straight_on(row: NDArray[np.void], at_us: NDArray[np.int64], brake_m_s2: float) -> Array:
-    """Return where a vehicle that its agent does not fly is taken to be, (N, 3) NED [m], at times (N,) [us]."""
+def _state(row: NDArray[np.void]) -> VehicleState:
+    """Return the state of a vehicle that its agent does not fly, as far as its path follows from it."""
     age_us = float(row["state_age_ms"]) * 1e3
-    state = VehicleState(
+    return VehicleState(
         t_us=int(row["t_us"] - age_us),
         pos_ned_m=row["pos_ned_m"],
         vel_ned_m_s=row["vel_ned_m_s"],
@@ -214,8 +218,6 @@ def _straight_on(row: NDArray[np.void], at_us: NDArray[np.int64], brake_m_s2: fl
         landed=Landed.UNKNOWN,
         failsafe=False,
     )
-    ahead_s: Array = (at_us - state.t_us).astype(np.float64) * 1e-6
-    return predict_constant_velocity(state, ahead_s, brake_m_s2)
 
 
 def _statuses(peer: int, rows: NDArray[np.void]) -> Iterator[Heard]:

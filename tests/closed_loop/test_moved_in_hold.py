@@ -1,0 +1,60 @@
+"""A vehicle that a ground station moves in its autopilot's hold, past agents that hover in their mission."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import development as mavlink
+
+from sitl.lockstep import Lockstep
+from swarmctl.control.estimation.constant_velocity import StopJudge
+from swarmctl.mavlink.codec import Codec
+from tests.closed_loop.conftest import COARSE, Fly, closer_than
+
+STARTS_NED_M = [[0.0, 0.0, -5.0], [0.0, 1.1, -5.0], [0.0, -1.1, -5.0], [6.0, 0.05, -5.0]]
+MOVED, BEYOND_NED_M, SPEED_M_S = 3, (-6.0, 0.05, -5.0), 2.0
+SCENE = (
+    *COARSE,
+    "sitl.start=air",
+    "swarm.agents=4",
+    f"start.positions_ned_m={json.dumps(STARTS_NED_M)}",
+    "mission.kind=hover",
+    "mission.duration_s=12",
+)
+TAKEN_S, MOVED_S, WATCHED_S = 0.5, 1.0, 8.0  # mission time, and after that
+BODY_M = 0.65
+
+
+def take(running: Lockstep) -> None:
+    """A ground station sets HOLD."""
+    numbers = (1.0, 4.0, 3.0, 0.0, 0.0, 0.0, 0.0)
+    message = mavlink.MAVLink_command_long_message(MOVED + 1, 1, mavlink.MAV_CMD_DO_SET_MODE, 0, *numbers)
+    running.links[MOVED][0].send(Codec(255, 190).encode(message))
+
+
+def move(running: Lockstep) -> None:
+    """It has the vehicle fly to a point beyond the others (DO_REPOSITION)."""
+    autopilot, world = running.world.autopilots[MOVED], running.world
+    north_m, east_m, down_m = np.array(BEYOND_NED_M) - world.origins[MOVED].offset_ned_m
+    autopilot.flight.cruise(SPEED_M_S)
+    autopilot.reposition((float(north_m), float(east_m), float(down_m)), math.nan)
+
+
+@pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
+def test_others_keep_away_from_who_is_moved_in_hold(fly: Fly, mode: str) -> None:
+    flight = fly(*SCENE, f"separation.mode={mode}", at={TAKEN_S: take, MOVED_S: move})
+    assert flight.separation_m() >= 0.85
+    way_m = flight.pos_ned_m[:, MOVED, 0]
+    assert way_m.min() < -4.0, "it has passed them"
+
+
+@pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
+def test_negative_control_who_is_taken_to_stop_all_the_time_comes_close(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    monkeypatch.setattr(StopJudge, "update", lambda self, state: True)
+    at = {TAKEN_S: take, MOVED_S: move}
+    assert fly(*SCENE, f"separation.mode={mode}", at=at, until=closer_than(BODY_M)).separation_m() < BODY_M
