@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 
-import numpy as np
+import pymap3d
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
@@ -24,23 +24,30 @@ SCENE = (
     "mission.kind=hover",
     "mission.duration_s=12",
 )
-TAKEN_S, MOVED_S, WATCHED_S = 0.5, 1.0, 8.0  # mission time, and after that
+TAKEN_S, MOVED_S = 0.5, 1.0  # mission time
 BODY_M = 0.65
 
 
-def take(running: Lockstep) -> None:
-    """A ground station sets HOLD."""
-    numbers = (1.0, 4.0, 3.0, 0.0, 0.0, 0.0, 0.0)
-    message = mavlink.MAVLink_command_long_message(MOVED + 1, 1, mavlink.MAV_CMD_DO_SET_MODE, 0, *numbers)
+def say(running: Lockstep, message: mavlink.MAVLink_message) -> None:
+    """Send a message of a ground station to the vehicle."""
     running.links[MOVED][0].send(Codec(255, 190).encode(message))
 
 
+def take(running: Lockstep) -> None:
+    """Set HOLD."""
+    numbers = (1.0, 4.0, 3.0, 0.0, 0.0, 0.0, 0.0)
+    say(running, mavlink.MAVLink_command_long_message(MOVED + 1, 1, mavlink.MAV_CMD_DO_SET_MODE, 0, *numbers))
+
+
 def move(running: Lockstep) -> None:
-    """It has the vehicle fly to a point beyond the others (DO_REPOSITION)."""
-    autopilot, world = running.world.autopilots[MOVED], running.world
-    north_m, east_m, down_m = np.array(BEYOND_NED_M) - world.origins[MOVED].offset_ned_m
-    autopilot.flight.cruise(SPEED_M_S)
-    autopilot.reposition((float(north_m), float(east_m), float(down_m)), math.nan)
+    """Have the vehicle fly to a point beyond the others, at a speed."""
+    swarm = running.config.swarm
+    lat_deg, lon_deg, alt_m = pymap3d.ned2geodetic(
+        *BEYOND_NED_M, swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m
+    )
+    params = (SPEED_M_S, 1.0, 0.0, math.nan, round(lat_deg * 1e7), round(lon_deg * 1e7), alt_m)
+    frame, command = mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_CMD_DO_REPOSITION
+    say(running, mavlink.MAVLink_command_int_message(MOVED + 1, 1, frame, command, 0, 0, *params))
 
 
 @pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
