@@ -72,7 +72,7 @@ OPERATOR_VERBS = {
     ),
     "resume": OperatorVerb(
         help="Go on after `hold`, and take the vehicle back after a pilot or its autopilot took over.",
-        phases=_AIRBORNE | {"ARM"},  # also of a vehicle found in the air under a pilot
+        phases=_AIRBORNE | {"ARM", "LAND"},  # also of a vehicle found in the air under a pilot, or taken as it landed
     ),
     "land": OperatorVerb(
         help="Separate, then land.", phases=_NOT_LANDING | {"LAND"}, is_stop=True, never_superseded=True

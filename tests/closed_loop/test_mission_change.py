@@ -147,3 +147,22 @@ def test_a_file_that_this_swarm_can_not_fly_is_refused_before_it_is_sent(tmp_pat
         path.write_text(text)
         with pytest.raises(ConfigError, match=said):
             load_mission(config, path)
+
+
+def test_a_mission_below_the_ground_is_refused_where_only_the_vehicle_knows_the_ground(tmp_path: Path) -> None:
+    path = tmp_path / "below.toml"
+    points = "[[0.0, 0.0, -3.0], [4.0, 0.0, 4.0], [8.0, 0.0, -3.0]]"
+    path.write_text(
+        f'[mission]\nkind = "waypoints"\nduration_s = 9.0\nwaypoints.speed_m_s = 1.5\n'
+        f"waypoints.lists = [{{ points_ned_m = {points} }}]\n"
+    )
+    alone = ("swarm.agents=1", "start.positions_ned_m=[[0,0,-3]]", "mission.kind=hover", "mission.duration_s=60")
+    real = load(None, (*alone, "sitl.enabled=false", 'vehicles=[{sysid=1, url="udpin://0.0.0.0:14540"}]'))
+    message = mission_message(load_mission(real, path))  # it does not know the ground
+    flight = Lockstep(load(None, alone))
+    fly_until(flight, lambda: phase(flight, 0) is Phase.TRACK)
+    flight._operator.publish(topics.MISSION, encode_message(message))
+    flight.command(MISSION, 0, **{MISSION: float(message.mission), BEGIN: flight.clock.utc_us() * 1e-6 + 1.5})
+    fly_for(flight, 1.0)
+    (refused,) = events(flight, 0, "order_refused")
+    assert "above the ground at 2 m" in str(refused["reason"])

@@ -50,8 +50,14 @@ class MissionChange:
             for number in list(self._texts)[:-_KEPT]:
                 del self._texts[number]
 
-    def offer(self, order: Order, utc_us: int) -> OfferedMission | str:
-        """Return the mission that is ordered, or why it is not flown."""
+    def offer(self, order: Order, utc_us: int, ground_z_m: float | None) -> OfferedMission | str:
+        """Return the mission that is ordered, or why it is not flown.
+
+        Args:
+            order: of an operator.
+            utc_us: now.
+            ground_z_m: down coordinate of the ground, which the operator's side does not know of real vehicles.
+        """
         text = self._texts.get(int(order.arguments[MISSION]))
         if text is None:
             return "the mission has not arrived; give the order again"
@@ -61,9 +67,9 @@ class MissionChange:
             mission = MissionParams.model_validate_json(text)
         except ValidationError as error:
             return f"its mission has a wrong value: {error.errors()[0]['msg']}"
-        return self._reference(mission)
+        return self._reference(mission, ground_z_m)
 
-    def _reference(self, mission: MissionParams) -> OfferedMission | str:
+    def _reference(self, mission: MissionParams, ground_z_m: float | None) -> OfferedMission | str:
         setup, agents = self._setup, len(self._setup.starts_ned_m)
         if mission.is_own:
             return "a mission of somebody else's code is flown only by a launch that was started with it"
@@ -77,7 +83,7 @@ class MissionChange:
             duration_s=mission.duration_s,
             apart_m=budget.planned_m,
             downwash=setup.separation.downwash,
-            ground_z_m=None,  # the operator's side knows it
+            ground_z_m=ground_z_m,
             volume=setup.volume,
             fence=Geofence(setup.fence_ne_m) if setup.fence_ne_m else None,
         )

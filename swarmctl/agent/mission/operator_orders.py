@@ -76,7 +76,8 @@ class OperatorOrders:
 
     def _offer_mission(self, order: Order, now_us: int) -> str:
         """Have the state machine know the mission of an order; return why it is not flown, or ""."""
-        offered = self._missions.offer(order, self._ports.utc_of_us(now_us))
+        ground_z_m = self._state_machine.mission.ground_z_m
+        offered = self._missions.offer(order, self._ports.utc_of_us(now_us), ground_z_m)
         if isinstance(offered, str):
             return offered
         self._state_machine.mission.offered = offered

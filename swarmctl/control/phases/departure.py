@@ -12,6 +12,7 @@ from swarmctl.core.types import Array, FlightMode, Landed, Phase, VehicleState
 _MOST_NAMED = 4  # agents in one line
 LEAST_CLIMB_M = 0.5  # of a configuration
 _REFUSED_CLIMB_M = 0.25  # heights are estimates: a start at the least height must not be refused for a few centimetres
+_STOPPED_US = 3_000_000  # in hold below its height; a PX4 that has climbed goes on rising for a second in it
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
 
 
@@ -69,6 +70,7 @@ class Climb:
         self.ground_z_m = 0.0
         self.cut_short = self.was_ours = False
         self._hovering_us: int | None = None  # since when the autopilot hovers
+        self._stopped_us: int | None = None  # since when it holds below its height
 
     @property
     def height_m(self) -> float:
@@ -95,6 +97,12 @@ class Climb:
         self._hovering_us = (self._hovering_us or inputs.now_us) if hovers else None
         learned = inputs.arm_in is None or inputs.now_us - (self._hovering_us or inputs.now_us) >= _HOVER_LEARNING_US
         return hovers and learned
+
+    def is_stopped(self, inputs: PhaseInputs, state: VehicleState) -> bool:
+        """Return whether somebody else holds the vehicle below its height, for a while; call it in every tick."""
+        holds = state.mode is FlightMode.HOLD and state.landed is Landed.IN_AIR and self._hovering_us is None
+        self._stopped_us = (self._stopped_us or inputs.now_us) if holds else None
+        return self._stopped_us is not None and inputs.now_us - self._stopped_us > _STOPPED_US
 
     def cut(self) -> None:
         """Note that the climb ends where the vehicle is now; the agent flies the rest of it."""

@@ -49,7 +49,7 @@ def take_control(mission: MissionState, inputs: PhaseInputs, state: VehicleState
         mission.trajectories.keep_destination()
     elif not mission.interruptions.active:
         mission.go_on(inputs.now_us, inputs.utc_us, state)
-    if mission.held:
+    if mission.interruptions.active:
         mission.interruptions.stay(inputs.now_us, state)
 
 

@@ -64,8 +64,8 @@ class Interruptions:
         self.stay(now_us, state)
 
     def stay(self, now_us: int, state: VehicleState) -> None:
-        """Come to rest where a hold asks for it: here, or at a point."""
-        if self._point is None:
+        """Come to rest: here, or at the point that a hold asks for, unless the agent is paused."""
+        if self._point is None or self.paused:
             self._trajectories.stop(now_us, state)
         else:
             self._trajectories.go_to(self._point.ned_m, now_us, state, self._point.speed_m_s)

@@ -29,6 +29,7 @@ REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
 SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
 PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
 COMPLETED = "completed"  # the outcome of a mission that was flown to its end
+TAKES_BACK_US = 5_000_000  # from an operator's resume, for which the autopilot may take to follow setpoints again
 TAKEN_OVER = "pilot or autopilot took over"
 
 
@@ -68,6 +69,7 @@ class MissionState:
         offered: the mission that the order `mission` has flown.
         stop_verb: land or rtl, from the command until the stop begins.
         may_take_control: an operator's resume permits taking control from any mode.
+        resumed_us: monotonic time of that resume.
         setpoints_stopped: the override has followed from that.
         airborne: the vehicle was found in the air at start-up.
         landing_seen: the autopilot lands, or has.
@@ -89,7 +91,7 @@ class MissionState:
         self.begin_utc_us: int | None = None
         self.gone_us: int | None = None
         self.first_tick_us: int | None = None
-        self.requested_us = -REQUEST_PERIOD_US
+        self.requested_us = self.resumed_us = -REQUEST_PERIOD_US
         self.offered: OfferedMission | None = None
         self.had_control = self.pilot_override = self.may_take_control = False
         self.setpoints_stopped = self.airborne = self.landing_seen = False
@@ -118,6 +120,11 @@ class MissionState:
     def held(self) -> bool:
         """Return whether the operator has asked to hold, or to go to a point."""
         return self.interruptions.held
+
+    @property
+    def ground_z_m(self) -> float | None:
+        """Return the down coordinate of the place that the vehicle took off from; None where that is not known."""
+        return None if self.airborne or self.phase < Phase.TAKEOFF else self.climb.ground_z_m
 
     @property
     def yaw_rad(self) -> float | None:
@@ -179,6 +186,10 @@ class MissionState:
             setpoints_stopped=self.setpoints_stopped,
             completed=self.outcome == COMPLETED,
         )
+
+    def takes_back(self, now_us: int) -> bool:
+        """Return whether the agent is taking the vehicle back, after an operator's resume, and does not have it yet."""
+        return self.may_take_control and not self.had_control and now_us - self.resumed_us < TAKES_BACK_US
 
     def is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Return whether the vehicle is on the ground and known to be disarmed."""

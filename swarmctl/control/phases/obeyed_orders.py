@@ -84,8 +84,14 @@ def _resume(mission: MissionState, order: Order, now_us: int, utc_us: int, state
     elif mission.pilot_override:
         _excuse_waiting(mission, now_us, mission.overridden_us)
         mission.rejoin_mission(now_us, utc_us, state)
-    if mission.pilot_override:
-        mission.pilot_override, mission.outcome, mission.may_take_control = False, mission.outcome_before, True
+    if not mission.pilot_override:
+        return
+    mission.pilot_override, mission.outcome, mission.may_take_control = False, mission.outcome_before, True
+    mission.resumed_us, mission.landing_seen = now_us, False
+    if mission.phase is Phase.TAKEOFF and state.landed is not Landed.ON_GROUND:
+        mission.climb.cut()
+    if mission.phase is Phase.LAND:  # who took it may have left it among others
+        mission.stop_in_place(now_us, state)
 
 
 def _release(mission: MissionState, now_us: int, state: VehicleState) -> None:

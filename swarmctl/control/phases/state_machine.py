@@ -129,8 +129,14 @@ class MissionStateMachine:
         )
 
     def _respond(self, inputs: PhaseInputs, state: VehicleState) -> None:
-        """Give up, fly home or pause as the failsafe asks for."""
+        """Give up, fly home or pause as the failsafe asks for.
+
+        A vehicle that is being taken back is waited for: until the agent has it, its autopilot would land it where a
+        pilot has left it, among others and above whatever is there.
+        """
         mission = self.mission
+        if mission.takes_back(inputs.now_us):
+            return
         if inputs.mode is Mode.LAND and mission.phase < Phase.LAND:
             mission.give_up("no plan for too long", inputs, state)
         if inputs.overload is Level.LAND and mission.may_fly_on:

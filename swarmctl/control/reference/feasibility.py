@@ -124,7 +124,7 @@ def _rules(
     ]
     if limits.ground_z_m is not None:
         low = pos[:, 2] > limits.ground_z_m - _GROUND_M
-        below = f"less than {_GROUND_M:g} m above the ground at sitl.ground_z_m = {limits.ground_z_m:g} (NED)"
+        below = f"less than {_GROUND_M:g} m above the ground at {limits.ground_z_m:.4g} m (NED)"
         ground = f"the reference is at z = {{}} m, {below}"
         rules.append(_Rule(broken=low & finite, said=ground, values=pos[:, 2]))
     if limits.volume is not None:

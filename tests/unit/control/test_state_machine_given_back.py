@@ -9,7 +9,7 @@ from swarmctl.control.failsafe.decision import Escalation, Response
 from swarmctl.control.phases.mission_state import TAKEN_OVER
 from swarmctl.control.phases.trajectories import OfferedMission
 from swarmctl.control.reference.mission import MissionParams, MissionReference
-from swarmctl.core.types import FlightMode, Mode, Phase, Verb
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.state_machine_flight import START, UTC0_US, Flight
 
 
@@ -108,3 +108,77 @@ def test_a_mission_ordered_while_some_wait_begins_for_all_at_the_time_of_the_ord
         flight.step()
         begins[phase] = flight.mission.begin_utc_us
     assert begins[Phase.READY] == begins[Phase.TRACK]
+
+
+# -- what a resume is not taken for ------------------------------------------------------------------------------------
+
+
+def test_a_worn_battery_waits_for_who_takes_its_vehicle_back() -> None:
+    """Its autopilot would land it where the pilot has left it, on whatever is there."""
+    flight = away(Phase.TRACK, 5.0)
+    flight.escalation = Escalation(Response.RTL, "battery at 15 %")
+    assert set(flight.run(1.0)) == {Verb.EXTERNAL}
+    assert flight.at == "TRACK"
+    flight.flight_mode, flight.failsafe_mode = FlightMode.EXTERNAL, Mode.TRACKING
+    flight.step()
+    flight.step()
+    assert (flight.at, flight.mission.landing.in_place) == ("GOTO_LAND", False)
+
+
+def test_a_worn_battery_waits_no_longer_than_a_vehicle_may_take_to_be_had_back() -> None:
+    flight = away(Phase.TRACK, 5.0)
+    flight.escalation = Escalation(Response.LAND, "battery at 8 %")
+    flight.run(6.0)
+    assert flight.at == "LAND"
+
+
+def test_who_rests_for_a_silent_peer_rests_where_its_pilot_has_left_it() -> None:
+    flight = Flight().until(Phase.TRACK)
+    flight.unresponsive_peer = True
+    flight.run(1.0)
+    assert flight.mission.interruptions.paused
+    flight.flight_mode = FlightMode.MANUAL
+    flight.failsafe_mode = Mode.PILOT_OVERRIDE
+    flight.run(5.0)
+    flight.pos = flight.pos + np.array([20.0, 0.0, 0.0])
+    flight.flight_mode, flight.failsafe_mode = FlightMode.HOLD, Mode.PRIMING
+    assert flight.ask("resume") == ""
+    flight.step()
+    flight.flight_mode, flight.failsafe_mode = FlightMode.EXTERNAL, Mode.TRACKING
+    flight.step()
+    assert flight.mission.interruptions.paused
+    reference, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.array([0.0, 5.0]))
+    assert np.abs(reference - flight.pos).max() < 0.5
+
+
+def test_a_landing_that_a_pilot_interrupts_is_taken_back_and_flown_to_where_there_is_room() -> None:
+    flight = Flight().until(Phase.LAND)
+    flight.flight_mode = FlightMode.LAND
+    flight.step()
+    assert flight.ask("resume") == ""
+    assert flight.run(1.0) == [], "it has landed without"
+    flight.flight_mode = FlightMode.HOLD
+    flight.run(1.0)
+    assert flight.mission.pilot_override
+    assert "take it back with: resume" in flight.ask("land")
+    assert flight.ask("resume") == ""
+    assert flight.run(1.0) == [Verb.EXTERNAL]
+    assert flight.at == "GOTO_LAND"
+    flight.flight_mode, flight.failsafe_mode = FlightMode.EXTERNAL, Mode.TRACKING
+    assert Verb.LAND in flight.run(10.0)
+
+
+@pytest.mark.parametrize("mode", [FlightMode.HOLD, FlightMode.MANUAL])
+def test_a_climb_that_somebody_stops_is_noted_and_flown_to_its_end_after_a_resume(mode: FlightMode) -> None:
+    flight = Flight().until(Phase.TAKEOFF)
+    flight.flight_mode, flight.landed = FlightMode.TAKEOFF, Landed.IN_AIR
+    flight.pos = START + np.array([0.0, 0.0, 1.0])
+    flight.step()
+    flight.flight_mode = mode
+    flight.run(2.0 if mode is FlightMode.HOLD else 0.0)
+    assert not flight.mission.pilot_override or mode is FlightMode.MANUAL
+    flight.run(2.0)
+    assert flight.mission.outcome == TAKEN_OVER
+    assert flight.ask("resume") == ""
+    assert flight.run(1.0) == [Verb.EXTERNAL]
+    assert flight.at == "GOTO_START"

@@ -14,6 +14,8 @@ from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, Vehicl
 def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
     """Request the climb, and wait until the vehicle hovers; a hold interrupts it."""
     climbed = mission.climb.update(inputs, state)
+    if mission.may_take_control and mission.climb.cut_short:  # given back in whatever mode it hovers
+        climbed = True
     if climbed and not mission.held:
         mission.enter(Phase.GOTO_START, inputs.now_us)
         return []
@@ -28,6 +30,9 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
     if mission.held:
         ours = state.mode is not FlightMode.HOLD and not others
         return [Command(verb=Verb.HOLD)] if ours and mission.may_request(inputs) else []
+    if mission.climb.is_stopped(inputs, state):
+        handover.leave_control(mission, inputs)
+        return []
     if (
         state.mode is not FlightMode.TAKEOFF
         and state.landed is Landed.ON_GROUND
