@@ -97,6 +97,23 @@ def test_what_a_pilot_lands_while_it_takes_off_stays_down(field: Fielder, kind: 
     assert not vehicle.armed
 
 
+@pytest.mark.parametrize("phase", ["TAKEOFF", "LAND"])
+def test_what_a_pilot_holds_on_its_way_up_or_down_is_taken_back(field: Fielder, phase: str) -> None:
+    here = field(PX4, 1)
+    launched = here.launch(PX4_CONFIG, *LONE_PX4, "--duration", "3")
+    launched.until_phase(phase, 1)
+    vehicle = here.witness.vehicles[0]
+    here.witness.wait(lambda: vehicle.height_m() > CLIMBED_M, 30.0, "off the ground")
+    here.witness.command(0, mav.MAV_CMD_DO_SET_MODE, 1, 4, 3)
+    here.witness.wait(lambda: mode_of(here, 0) == LOITER, 2.5, "in LOITER")
+    time.sleep(5.0)
+    assert mode_of(here, 0) == LOITER, "the pilot has it"
+    assert launched.verb("land").returncode == EXIT_MISSION, "take it back with: resume"
+    assert launched.verb("resume").returncode == 0
+    assert launched.end(END_S) == 0, launched.text()
+    here.witness.wait(lambda: not vehicle.armed, GROUND_S, "landed and disarmed")
+
+
 def test_who_only_warns_of_its_battery_flies_on(field: Fielder) -> None:
     here = booted(field, 1)
     launched = here.launch(ARDUPILOT_CONFIG)
