@@ -8,6 +8,7 @@ import signal
 import time
 
 import pyarrow.parquet as pq
+import pymap3d
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
@@ -32,6 +33,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 LOITER, OFFBOARD = 0x03040000, 0x00060000
 PHASES = ("CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND", "LAND")
 CLIMBED_M, START_HEIGHT_M = 0.5, 2.0
+MOVED_M_S = 2.0  # by a ground station, in hold
 STRAYED_M = 20.0  # from the middle of the circle; followed for 40 s, the lost position led 180 m away
 STOPPED_S = 60.0  # within which nothing is armed any more, or it is named
 
@@ -95,6 +97,29 @@ def test_what_a_pilot_lands_while_it_takes_off_stays_down(field: Fielder, kind: 
     assert launched.end(END_S) == EXIT_MISSION, launched.text()
     assert "pilot or autopilot took over" in launched.text()
     assert not vehicle.armed
+
+
+def test_others_make_way_for_who_is_moved_in_hold(field: Fielder) -> None:
+    here = field(PX4, 3)
+    launched = here.launch(PX4_CONFIG, "--set", "mission.kind=hover", "--duration", "30")
+    launched.until_phase("TRACK", 3)
+    time.sleep(2.0)
+    here.witness.command(2, mav.MAV_CMD_DO_SET_MODE, 1, 4, 3)
+    here.witness.wait(lambda: mode_of(here, 2) == LOITER, 2.5, "in LOITER")
+    time.sleep(2.0)
+    vehicle, origin = here.witness.vehicles[2], PX4.origin
+    north_m, east_m, down_m = vehicle.pos_ned_m[-1]
+    beyond = pymap3d.ned2geodetic(-4.0 * north_m, east_m, down_m, origin.lat_deg, origin.lon_deg, origin.alt_m)
+    params = (MOVED_M_S, 1.0, 0.0, math.nan, round(beyond[0] * 1e7), round(beyond[1] * 1e7), beyond[2])
+    numbers = 3, 1, mav.MAV_FRAME_GLOBAL, mav.MAV_CMD_DO_REPOSITION, 0, 0
+    here.witness.say(2, mav.MAVLink_command_int_message(*numbers, *params))
+    here.witness.wait(lambda: abs(vehicle.pos_ned_m[-1][0] + 4.0 * north_m) < 2.0, 20.0, "past the others")
+    assert launched.verb("land").returncode == EXIT_MISSION, "it has a pilot"
+    assert launched.verb("resume").returncode == 0
+    launched.end(END_S)
+    here.witness.wait(here.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
+    print(f"least true separation {here.witness.min_separation_m():.2f} m")
+    assert here.witness.min_separation_m() > BODIES_M
 
 
 @pytest.mark.parametrize("phase", ["TAKEOFF", "LAND"])
