@@ -166,3 +166,19 @@ def test_a_mission_below_the_ground_is_refused_where_only_the_vehicle_knows_the_
     fly_for(flight, 1.0)
     (refused,) = events(flight, 0, "order_refused")
     assert "above the ground at 2 m" in str(refused["reason"])
+
+
+def test_a_mission_on_whose_way_the_fence_is_left_is_refused(tmp_path: Path) -> None:
+    """The fence has two arms; the mission is in the other one."""
+    fence = "geofence.corners_ne_m=[[-3,-3],[20,-3],[20,3],[3,3],[3,20],[-3,20]]"
+    place = ("swarm.agents=1", "start.positions_ned_m=[[12,0,-3]]", "mission.kind=hover", "sitl.start=air")
+    flight = Lockstep(load(None, (*place, "mission.duration_s=60", fence)))
+    fly_until(flight, lambda: phase(flight, 0) is Phase.TRACK)
+    for goal, reasons in (("[12.0, 2.0, -3.0]", []), ("[0.0, 14.0, -3.0]", ["on the way is outside of the geofence"])):
+        path = tmp_path / f"{len(reasons)}.toml"
+        lists = f"[{{ points_ned_m = [{goal}, {goal.replace('-3.0', '-4.0')}] }}]"
+        path.write_text(f'[mission]\nkind = "waypoints"\nduration_s = 20.0\nwaypoints.lists = {lists}\n')
+        order(flight, path)
+        fly_for(flight, 1.0)
+        refused = [str(event["reason"]) for event in events(flight, 0, "order_refused")]
+        assert [words in reason for words, reason in zip(reasons, refused, strict=True)] == [True] * len(reasons)

@@ -11,7 +11,7 @@ from swarmctl.control.phases.interruptions import HoldPoint
 from swarmctl.control.phases.mission_state import SPIN_UP_US, MissionState
 from swarmctl.core.operator_verbs import BEGIN, GOTO, MISSION, POINT, SPEED, YAW, Order
 from swarmctl.core.text import point_text
-from swarmctl.core.types import Landed, Phase, VehicleState
+from swarmctl.core.types import Array, Landed, Phase, VehicleState
 
 _MINUTES = 3.0  # a longer flight is told in minutes
 _WHOLE_M = 100.0  # a longer way is told in whole metres
@@ -59,6 +59,15 @@ def outcome_of(order: Order, mission: MissionState) -> str:
     away_m, minutes = math.dist(way.from_ned_m, way.to_ned_m), way.travel_s / 60.0
     takes = f"{minutes:.0f} min" if minutes > _MINUTES else f"{way.travel_s:.0f} s"
     return f"flies to {point_text(way.to_ned_m)}: {away_m:.{0 if away_m > _WHOLE_M else 1}f} m, {takes}"
+
+
+def way_into(mission: MissionState, order: Order, utc_us: int, state: VehicleState | None) -> Array | None:
+    """Return points (K, 3) on the way into a mission that is ordered; None of an order that leads into none at once."""
+    if order.verb != MISSION or mission.offered is None or state is None:
+        return None
+    if mission.phase is not Phase.TRACK or mission.interruptions.active:
+        return None
+    return mission.trajectories.way_into(mission.offered.reference, utc_us * 1e-6 - order.arguments[BEGIN], state)
 
 
 def _change_mission(mission: MissionState, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.operator_verbs import FAR, FAR_M, GOTO, OPERATOR_VERBS, POINT, Order
 from swarmctl.core.text import point_text
-from swarmctl.core.types import Landed, Phase, VehicleState
+from swarmctl.core.types import Array, Landed, Phase, VehicleState
 
 Contains = Callable[[tuple[float, float]], bool]  # whether north and east [m] lie within the geofence
 _WAY_STEP_M = 1.0  # between points of a straight way that are checked
@@ -33,6 +33,7 @@ class OrderSituation:
     controls: bool  # the autopilot follows the agent's setpoints
     paused: bool  # it rests because a peer is silent or deadlines are missed
     lowest_m: float  # down coordinate that it may not go below
+    way_ned_m: Array | None  # (K, 3) on which it would join a mission that is ordered; None where it does not at once
     contains: Contains
     volume: FlightVolume | None  # that plans keep to
 
@@ -59,6 +60,8 @@ def refusal_of(order: Order, situation: OrderSituation) -> str:
         return "nothing is known of its vehicle now"
     if phase is Phase.TAKEOFF and order.verb == "hold" and situation.other_control:
         return f"its pilot or autopilot flies it in {situation.state.mode.name}"
+    if situation.way_ned_m is not None:
+        return _way_refusal(situation.way_ned_m, situation)
     return _goto_refusal(order, situation.state, situation) if order.verb == GOTO else ""
 
 
@@ -77,6 +80,11 @@ def _goto_refusal(order: Order, state: VehicleState, situation: OrderSituation) 
     if situation.volume is not None and (refusal := situation.volume.refusal(target)):
         return refusal
     points = min(_MOST_WAY_POINTS, 2 + int(math.dist(state.pos_ned_m[:2], target[:2]) / _WAY_STEP_M))
-    way = np.linspace(target[:2], state.pos_ned_m[:2], points)
-    outside = [(float(north), float(east)) for north, east in way if not situation.contains((north, east))]
-    return "" if not outside else f"{outside[0][0]:.1f}, {outside[0][1]:.1f} on the way is outside of the geofence"
+    return _way_refusal(np.linspace(target, state.pos_ned_m, points), situation)
+
+
+def _way_refusal(way_ned_m: Array, situation: OrderSituation) -> str:
+    """Return where a way (K, 3) first leaves the geofence, or ""."""
+    level = map(tuple, way_ned_m[:, :2].tolist())
+    outside = next(((north, east) for north, east in level if not situation.contains((north, east))), None)
+    return "" if outside is None else f"{outside[0]:.1f}, {outside[1]:.1f} on the way is outside of the geofence"

@@ -100,7 +100,7 @@ class MissionStateMachine:
 
         A stop (land, rtl) is kept until a vehicle state is known to begin it from, so it is lost in no phase.
         """
-        if refusal := refusal_of(order, self._situation(state)):
+        if refusal := refusal_of(order, self._situation(order, utc_us, state)):
             return refusal
         if OPERATOR_VERBS[order.verb].is_stop:
             self.mission.stop_verb = order.verb
@@ -111,7 +111,7 @@ class MissionStateMachine:
             obeyed_orders.ORDERS[order.verb](self.mission, order, now_us, utc_us, state)
         return ""
 
-    def _situation(self, state: VehicleState | None) -> OrderSituation:
+    def _situation(self, order: Order, utc_us: int, state: VehicleState | None) -> OrderSituation:
         mission = self.mission
         # the ground's height is known after a take-off
         lowest_m = float(mission.start_ned_m[2]) if mission.airborne else mission.climb.ground_z_m - _LEAST_HEIGHT_M
@@ -124,6 +124,7 @@ class MissionStateMachine:
             controls=mission.had_control,
             paused=mission.interruptions.paused,
             lowest_m=lowest_m,
+            way_ned_m=obeyed_orders.way_into(mission, order, utc_us, state),
             contains=mission.contains,
             volume=mission.volume,
         )

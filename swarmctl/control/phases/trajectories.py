@@ -11,6 +11,8 @@ from swarmctl.control.reference.mission import MissionReference
 from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.types import Array, VehicleState
 
+_WAY_POINTS = 300  # of a way that is checked
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BegunTrajectory:
@@ -96,10 +98,19 @@ class Trajectories:
 
     def rejoin_mission(self, mission_t_s: float, now_us: int, state: VehicleState) -> None:
         """Rejoin the mission's moving reference along a quintic offset: after a jump all agents would rush together."""
-        pos, vel = self._mission.sample(np.array([mission_t_s]))
-        offset, drift = state.pos_ned_m - pos[0], state.vel_ned_m_s - vel[0]
-        way = quintic_to(offset, drift, np.zeros(3), self._speed_m_s, accel_m_s2=self._accel_m_s2)
+        way = self._offset_to(self._mission, mission_t_s, state)
         self._rejoin_offset = BegunTrajectory(trajectory=way, began_us=now_us)
+
+    def way_into(self, mission: MissionReference, mission_t_s: float, state: VehicleState) -> Array:
+        """Return points (K, 3) of the way on which a mission's moving reference would be joined."""
+        way = self._offset_to(mission, mission_t_s, state)
+        t_s = np.linspace(0.0, way.travel_s, _WAY_POINTS)
+        return np.asarray(mission.sample(mission_t_s + t_s)[0] + way.sample(t_s)[0])
+
+    def _offset_to(self, mission: MissionReference, mission_t_s: float, state: VehicleState) -> QuinticTrajectory:
+        pos, vel = mission.sample(np.array([mission_t_s]))
+        offset, drift = state.pos_ned_m - pos[0], state.vel_ned_m_s - vel[0]
+        return quintic_to(offset, drift, np.zeros(3), self._speed_m_s, accel_m_s2=self._accel_m_s2)
 
     def _begin(self, trajectory: QuinticTrajectory, now_us: int) -> None:
         self.current = BegunTrajectory(trajectory=trajectory, began_us=now_us)
