@@ -45,6 +45,7 @@ _TINY = 1e-6
 _SLACK_WEIGHT = 100.0  # a larger one would trade all of the thrust for a trace of distance
 _LAG_STEP_S = 1e-3
 _THRUST_CHANGE_M_S2 = 2.5  # largest change of vertical thrust: without thrust there is no braking either
+_THRUSTS, _SAME_THRUST_M_S2 = 4, 0.05  # how often, and until when, bounds are computed for the thrust that results
 _FARTHEST_M_S2 = 40.0  # rows that ask for less than minus this are met by any acceleration
 
 
@@ -180,13 +181,32 @@ class Barrier:
         slew_bounds = [
             self._slew_bounds(u, held) for u, held in zip((ux, uy), start.virtual_control.tolist(), strict=False)
         ]
-        bounds = self._bounds(wanted, thrust, slew_bounds, hover_thrust_01)
-        thrust_vector = project_or_violate_least(wanted, rows, bounds, _SLACK_WEIGHT)
-        size = math.sqrt(_dot(thrust_vector, thrust_vector))
+        thrust_vector, size = self._nearest(wanted, rows, slew_bounds, thrust, hover_thrust_01)
         if size < _TINY:
             return None
         flown = [min(most, max(least, f / size)) for f, (least, most) in zip(thrust_vector, slew_bounds, strict=False)]
         return np.array([*flown, size])
+
+    def _nearest(
+        self,
+        wanted: Vector,
+        rows: Sequence[Row],
+        slew_bounds: Sequence[tuple[float, float]],
+        thrust_m_s2: float,
+        hover_thrust_01: float,
+    ) -> tuple[Vector, float]:
+        """Return the thrust vector nearest to the wanted one within all rows and bounds, and its size.
+
+        What u_x and u_y may be bounds forces by the thrust that results: with less of it than was wanted, the same
+        force is more tilt. Bounded by the wanted one, a vehicle that has to brake leaned on towards what it brakes for.
+        """
+        for _ in range(_THRUSTS):
+            bounds = self._bounds(wanted, thrust_m_s2, slew_bounds, hover_thrust_01)
+            vector = project_or_violate_least(wanted, rows, bounds, _SLACK_WEIGHT)
+            before, thrust_m_s2 = thrust_m_s2, math.sqrt(_dot(vector, vector))
+            if thrust_m_s2 < _TINY or abs(thrust_m_s2 - before) < _SAME_THRUST_M_S2:
+                break
+        return vector, thrust_m_s2
 
     def _predicted_state(self, start: Start, disturbance_ned_m_s2: Array) -> tuple[Vector, Vector]:
         """Predict the own position and velocity (3,) to when a command of now takes effect, under the one now held."""

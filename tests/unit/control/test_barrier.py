@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from swarmctl.control.collision import barrier as barrier_module
 from swarmctl.control.collision.barrier import Barrier, BarrierParams, Body, body_of_obstacle, body_of_peer
 from swarmctl.control.collision.separation import SeparationParams, align
 from swarmctl.control.model import VehicleModelParams, acceleration
@@ -31,6 +32,11 @@ def filtered(barrier: Barrier, virtual_control: Array, start: Start, bodies: lis
 
 def start(pos: Array, vel: Array, held: Array = HOVER) -> Start:
     return builders.start(pos_ned_m=pos, vel_ned_m_s=vel, virtual_control=held)
+
+
+def lift_m_s2(command: Array) -> float:
+    """Return the vertical thrust over mass of a command (3,)."""
+    return float(command[2] * math.sqrt(1.0 - command[:2] @ command[:2]))
 
 
 def fly_at_goals(
@@ -212,7 +218,7 @@ def test_commands_stay_within_the_airframe_bounds() -> None:
         assert np.isfinite(found).all()
         assert np.abs(found[:2] - held[:2]).max() <= slew + 1e-9
         assert np.abs(found[:2]).max() <= MODEL.u_max() + 1e-9
-        assert abs(found[2] - wanted[2]) < 3.5
+        assert abs(lift_m_s2(found) - lift_m_s2(wanted)) < 2.5 + 0.1, "vertical thrust, with what clipped tilt adds"
     assert acted > 150
 
 
@@ -290,3 +296,42 @@ def test_downwash_demands_more_distance_vertically_than_horizontally() -> None:
     found = filtered(Barrier(PARAMS, MODEL, DT_S, downwash=2.0), HOVER, sinking, below)
     assert found is not None
     assert found[2] > GRAVITY_M_S2
+
+
+# -- an obstacle ahead of a vehicle that is tilted towards it ----------------------------------------------------------
+
+TICK_S = 0.04
+
+
+def towards_an_obstacle(u: float, higher_m: float) -> list[float]:
+    """Fly at 3 m/s, tilted ahead by u, at an obstacle that comes at 1.5 m/s; return u and each u_x that is sent."""
+    wanted = np.array([u, 0.0, GRAVITY_M_S2 / math.sqrt(1.0 - u * u)])
+    barrier, held, sent = Barrier(PARAMS, MODEL, TICK_S), wanted, [u]
+    pos, vel, apart_m = np.zeros(3), np.array([3.0, 0.0, 0.0]), 0.875
+    for k in range(6):
+        ahead = Body(
+            pos_ned_m=(2.5 + apart_m - 1.5 * k * TICK_S, 0.0, -higher_m),
+            vel_ned_m_s=(-1.5, 0.0, 0.0),
+            apart_m=apart_m,
+            responsibility_01=1.0,
+            solid=True,
+        )
+        changed = filtered(barrier, wanted, start(pos, vel, held), [ahead])
+        held = wanted if changed is None else changed
+        sent.append(float(held[0]))
+        accel = acceleration(held)
+        pos, vel = pos + TICK_S * vel + 0.5 * TICK_S**2 * accel, vel + TICK_S * accel
+    return sent
+
+
+@pytest.mark.parametrize("higher_m", [0.03, 0.2, -0.1])
+@pytest.mark.parametrize("u", [-0.2, -0.4, -0.65])
+def test_who_has_to_brake_sheds_its_tilt_as_fast_as_it_may(u: float, higher_m: float) -> None:
+    assert np.diff(towards_an_obstacle(u, higher_m)).min() > 0.9 * PARAMS.slew_1_s * TICK_S
+
+
+@pytest.mark.parametrize("u", [-0.4, -0.65])
+def test_negative_control_bounded_by_the_wanted_thrust_it_leans_on(u: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Below something, thrust is traded for a trace of distance: the same force is more tilt then."""
+    monkeypatch.setattr(barrier_module, "_THRUSTS", 1)
+    assert max(towards_an_obstacle(u, 0.03)) < u + 0.01
