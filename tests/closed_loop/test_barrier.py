@@ -9,6 +9,8 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
+from swarmctl.control.collision import barrier
+from swarmctl.core.obstacle import Obstacle
 from tests.closed_loop.conftest import COARSE, ROOT, Flight, Fly, mission_is_over
 
 NO_ROWS = ("mission.kind=swap", "sitl.start=air", "controller.kind=mpc", "mission.duration_s=7")
@@ -80,3 +82,47 @@ def test_it_leaves_an_ordinary_flight_alone_bit_by_bit(fly: Fly) -> None:
     assert with_it.lockstep.truth.tobytes() == without.lockstep.truth.tobytes()
     for i in range(3):
         np.testing.assert_array_equal(with_it.ticks(i)["setpoint_q_nb"], without.ticks(i)["setpoint_q_nb"])
+
+
+# -- an obstacle ahead ------------------------------------------------------------------------------------------------
+
+AHEAD = (
+    *COARSE,
+    "sitl.start=air",
+    "swarm.agents=1",
+    "start.positions_ned_m=[[-12,0,-5]]",
+    "mission.kind=goto",
+    "mission.goto.goals_ned_m=[[14,0,-5]]",
+    "mission.goto.speed_m_s=4.5",
+    "mission.goto.accel_m_s2=2",
+    "mission.duration_s=12",
+)
+COMING = Obstacle(  # seen too late to stop for it as planned
+    center_ned_m=(13.0, 0.05, -5.1), radius_m=0.5, keep_out_m=1.1, visibility_m=4.0, vel_ned_m_s=(-1.0, 0.0, 0.0)
+)
+
+
+def clearance_m(fly: Fly) -> float:
+    """Return the least true distance of the centre of an x500 from the surface of an obstacle that comes at it."""
+    began_s: list[float] = []
+
+    def add(running: Lockstep) -> None:
+        running.set_obstacles([COMING])
+        began_s.append(running.clock.now_us() * 1e-6)
+
+    flight = fly(*AHEAD, config="x500_circle.toml", at={1.0: add})
+    since_s = flight.t_s[flight.t_s >= began_s[0]] - began_s[0]
+    centers = COMING.center_after(since_s[:, None])
+    places = flight.pos_ned_m[flight.t_s >= began_s[0], 0]
+    return float(np.linalg.norm(places - centers, axis=1).min()) - COMING.radius_m
+
+
+def test_a_body_that_flies_at_an_obstacle_does_not_touch_it(fly: Fly) -> None:
+    assert clearance_m(fly) > 0.5 * X500_BODY_M + 0.1
+
+
+def test_negative_control_with_tilts_bounded_by_the_wanted_thrust_it_does(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(barrier, "_THRUSTS", 1)
+    assert clearance_m(fly) < 0.5 * X500_BODY_M
