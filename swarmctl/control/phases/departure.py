@@ -13,6 +13,7 @@ _MOST_NAMED = 4  # agents in one line
 LEAST_CLIMB_M = 0.5  # of a configuration
 _REFUSED_CLIMB_M = 0.25  # heights are estimates: a start at the least height must not be refused for a few centimetres
 _STOPPED_US = 3_000_000  # in hold below its height; a PX4 that has climbed goes on rising for a second in it
+_NEAR_M = 1.0  # PX4 ends a climb 0.8 m below its height (NAV_MC_ALT_RAD), and estimates drift
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
 
 
@@ -99,14 +100,18 @@ class Climb:
         return hovers and learned
 
     def is_stopped(self, inputs: PhaseInputs, state: VehicleState) -> bool:
-        """Return whether somebody else holds the vehicle below its height, for a while; call it in every tick."""
+        """Return whether the vehicle has been in hold for a while without being at its height."""
         holds = state.mode is FlightMode.HOLD and state.landed is Landed.IN_AIR and self._hovering_us is None
         self._stopped_us = (self._stopped_us or inputs.now_us) if holds else None
         return self._stopped_us is not None and inputs.now_us - self._stopped_us > _STOPPED_US
 
+    def ends_near(self, state: VehicleState) -> bool:
+        """Return whether a vehicle in hold is as near to its height as autopilots take for enough."""
+        return abs(self.ground_z_m - float(state.pos_ned_m[2]) - self.height_m) < _NEAR_M
+
     def cut(self) -> None:
         """Note that the climb ends where the vehicle is now; the agent flies the rest of it."""
-        self.cut_short = True
+        self.cut_short, self._stopped_us = True, None
 
     def rest_ned_m(self, state: VehicleState) -> Array:
         """Return the end (3,) of the rest of a climb that was cut short, straight above or below the vehicle."""

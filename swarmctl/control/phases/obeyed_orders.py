@@ -99,7 +99,7 @@ def _resume(mission: MissionState, order: Order, now_us: int, utc_us: int, state
     mission.resumed_us, mission.landing_seen = now_us, False
     if mission.phase is Phase.TAKEOFF and state.landed is not Landed.ON_GROUND:
         mission.climb.cut()
-    if mission.phase is Phase.LAND:  # who took it may have left it among others
+    if mission.phase is Phase.LAND and state.landed is not Landed.ON_GROUND:  # it may have been left among others
         mission.stop_in_place(now_us, state)
 
 

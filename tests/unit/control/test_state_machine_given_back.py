@@ -182,3 +182,25 @@ def test_a_climb_that_somebody_stops_is_noted_and_flown_to_its_end_after_a_resum
     assert flight.ask("resume") == ""
     assert flight.run(1.0) == [Verb.EXTERNAL]
     assert flight.at == "GOTO_START"
+
+
+def test_a_climb_that_its_autopilot_ends_near_its_height_goes_on() -> None:
+    """Nobody has stopped it: estimates of heights drift."""
+    flight = Flight().until(Phase.TAKEOFF)
+    flight.flight_mode, flight.landed = FlightMode.TAKEOFF, Landed.IN_AIR
+    flight.pos = START + np.array([0.0, 0.0, 0.6])
+    flight.step()
+    flight.flight_mode = FlightMode.HOLD
+    flight.run(4.0)
+    assert (flight.at, flight.mission.pilot_override) == ("GOTO_START", False)
+
+
+def test_a_landing_that_can_not_be_had_back_is_landed_all_the_same() -> None:
+    flight = Flight().until(Phase.LAND)
+    flight.flight_mode = FlightMode.LAND
+    flight.step()
+    flight.flight_mode = FlightMode.HOLD
+    flight.run(1.0)
+    assert flight.ask("resume") == ""
+    assert set(flight.run(4.5)) == {Verb.EXTERNAL}
+    assert Verb.LAND in flight.run(10.0)

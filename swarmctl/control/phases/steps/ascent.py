@@ -31,7 +31,10 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
         ours = state.mode is not FlightMode.HOLD and not others
         return [Command(verb=Verb.HOLD)] if ours and mission.may_request(inputs) else []
     if mission.climb.is_stopped(inputs, state):
-        handover.leave_control(mission, inputs)
+        if mission.climb.ends_near(state):
+            mission.climb.cut()
+        else:
+            handover.leave_control(mission, inputs)
         return []
     if (
         state.mode is not FlightMode.TAKEOFF

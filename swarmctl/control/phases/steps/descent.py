@@ -15,7 +15,8 @@ def goto_land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -
     """Fly to the landing place; after too long, land where the vehicle is."""
     if mission.held:
         return []
-    if mission.may_take_control and not mission.had_control:  # a pilot has given it back
+    given_back = mission.may_take_control and not mission.had_control
+    if given_back and (mission.takes_back(inputs.now_us) or not mission.landing.in_place):
         return handover.request_control(mission, inputs, state)
     landing, controls = mission.landing, mission.had_control
     if landing.is_reached(inputs, state, controls=controls, paused=mission.interruptions.paused):
