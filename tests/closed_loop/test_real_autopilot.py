@@ -165,7 +165,6 @@ def test_three_vehicles_keep_their_assigned_places_around_the_reference() -> Non
 def test_three_vehicles_without_assigned_places_push_each_other_around_it() -> None:
     flight = fly(*IN_A_ROW, "separation.approach_01=0", "mission.duration_s=12")
     assert wandered_m(flight) > 0.12
-    assert together(flight)[1] < 0.89
 
 
 # -- separation radius and reported accuracy --------------------------------------------------------------------------
