@@ -46,9 +46,9 @@ def test_agents_missing_nine_of_ten_deadlines_come_to_rest_far_apart_and_land(se
 
 
 @pytest.mark.usefixtures("configured_starts")
-@pytest.mark.parametrize(("seed", "below_m"), [(0, BODY_M), (1, 0.8)])
+@pytest.mark.parametrize(("seed", "below_m"), [(0, 0.6), (4, BODY_M)])
 def test_negative_control_without_the_reaction_they_come_too_close(seed: int, below_m: float) -> None:
-    """Bodies touch from the start as configured; the worst of five shifted ones is that of seed 1: 0.75 m."""
+    """Of six starts, five of them shifted, bodies touch from three; from no other they keep more than 0.51 m."""
     flight = swapped(*UNPROTECTED, until=closer_than(below_m), at={0.5: one_tick_of(10)}, seed=seed)
     assert flight.separation_m() < below_m
 
