@@ -11,6 +11,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.mavlink.vehicle import local_frame
 from swarmctl.mavlink.vehicle.local_frame import LocalFrame
 from tests.closed_loop.conftest import Flight, Fly, closer_than
+from tests.closed_loop.test_lost_position import BESIDE, separation_aloft_m
 
 JUMP_M = 5.0
 AT_S = 4.0  # mission time of the jump
@@ -31,7 +32,7 @@ def fly_with_a_jump(fly: Fly, until: Callable[[Lockstep], bool] | None = None) -
     def over(running: Lockstep) -> bool:
         return bool(jumped_us) and running.clock.now_us() - jumped_us[0] > WATCHED_S * 1e6
 
-    flight = fly("sitl.start=air", "mission.duration_s=12", at={AT_S: jump}, until=until or over)
+    flight = fly("sitl.start=air", "mission.duration_s=20", at={AT_S: jump}, until=until or over)
     return flight, jumped_us[0] * 1e-6
 
 
@@ -57,21 +58,13 @@ def test_negative_control_a_jump_that_is_believed_at_once_ends_in_a_collision(
     assert "estimate_jumped" not in flight.event_names(0)
 
 
-# Two hover 1.2 m apart. The estimate of one jumps away from the other: drawn in, the vehicle comes that much closer.
-BESIDE = (
-    "swarm.agents=2",
-    "mission.kind=hover",
-    "mission.duration_s=12",
-    "start.positions_ned_m=[[0,0,-2],[-1.2,0,-2]]",
-)
-SHORT_JUMP_NED_M = (0.5, 0.0, 0.0)
+SHORT_JUMP_NED_M = (0.5, 0.0, 0.0)  # away from the other: drawn in, the vehicle comes that much closer
 
 
 def fly_beside_a_peer(fly: Fly, *sets: str) -> float:
-    """Return the least true distance while both are in the air."""
-    flight = fly(*BESIDE, *sets, at={AT_S: lambda running: running.world.estimator.jump(0, np.array(SHORT_JUMP_NED_M))})
-    aloft = (flight.pos_ned_m[:, :, 2] < flight.pos_ned_m[0, :, 2] - 0.5).all(axis=1)
-    return float(np.linalg.norm(np.diff(flight.pos_ned_m[aloft, :2], axis=1), axis=2).min())
+    """Return the least true distance of two that hover 1.2 m apart, while both are in the air."""
+    jump = {AT_S: lambda running: running.world.estimator.jump(0, np.array(SHORT_JUMP_NED_M))}
+    return separation_aloft_m(fly(*BESIDE, *sets, at=jump))
 
 
 @pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])

@@ -10,7 +10,7 @@ import pytest
 from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
 from swarmctl.bus.messages.json_messages import encode_message
-from swarmctl.config import load, load_mission
+from swarmctl.config import Config, load, load_mission
 from swarmctl.core.operator_verbs import BEGIN, MISSION
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
@@ -38,9 +38,9 @@ def swap(tmp_path: Path) -> Path:
     return path
 
 
-def order(flight: Lockstep, path: Path, agent: int = -1, *, sent: bool = True) -> None:
-    """Do what `swarmctl mission set` does."""
-    message = mission_message(load_mission(flight.config, path))
+def order(flight: Lockstep, path: Path, agent: int = -1, *, sent: bool = True, config: Config | None = None) -> None:
+    """Do what `swarmctl mission set` does, by the flight's configuration or another one."""
+    message = mission_message(load_mission(config or flight.config, path))
     if sent:
         flight._operator.publish(topics.MISSION, encode_message(message))
     arguments = {MISSION: float(message.mission), BEGIN: flight.clock.utc_us() * 1e-6 + 1.5}
@@ -158,14 +158,12 @@ def test_a_mission_below_the_ground_is_refused_where_only_the_vehicle_knows_the_
     )
     alone = ("swarm.agents=1", "start.positions_ned_m=[[0,0,-3]]", "mission.kind=hover", "mission.duration_s=60")
     real = load(None, (*alone, "sitl.enabled=false", 'vehicles=[{sysid=1, url="udpin://0.0.0.0:14540"}]'))
-    message = mission_message(load_mission(real, path))  # it does not know the ground
     flight = Lockstep(load(None, alone))
     fly_until(flight, lambda: phase(flight, 0) is Phase.TRACK)
-    flight._operator.publish(topics.MISSION, encode_message(message))
-    flight.command(MISSION, 0, **{MISSION: float(message.mission), BEGIN: flight.clock.utc_us() * 1e-6 + 1.5})
+    order(flight, path, config=real)  # which does not know the ground
     fly_for(flight, 1.0)
     (refused,) = events(flight, 0, "order_refused")
-    assert "above the ground at 2 m" in str(refused["reason"])
+    assert "above the ground at the place of the take-off = 2 (NED)" in str(refused["reason"])
 
 
 def test_a_mission_on_whose_way_the_fence_is_left_is_refused(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ SCENE = (
     "mission.duration_s=12",
 )
 TAKEN_S, MOVED_S = 0.5, 1.0  # mission time
-BODY_M = 0.65
+TOO_CLOSE_M = 0.65
 
 
 def say(running: Lockstep, message: mavlink.MAVLink_message) -> None:
@@ -64,4 +64,4 @@ def test_negative_control_who_is_taken_to_stop_all_the_time_comes_close(
 ) -> None:
     monkeypatch.setattr(StopJudge, "update", lambda self, state: True)
     at = {TAKEN_S: take, MOVED_S: move}
-    assert fly(*SCENE, f"separation.mode={mode}", at=at, until=closer_than(BODY_M)).separation_m() < BODY_M
+    assert fly(*SCENE, f"separation.mode={mode}", at=at, until=closer_than(TOO_CLOSE_M)).separation_m() < TOO_CLOSE_M

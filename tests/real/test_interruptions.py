@@ -49,6 +49,12 @@ def mode_of(here: Field, index: int) -> int:
     return here.witness.vehicles[index].beats[-1][2]
 
 
+def take(here: Field, index: int) -> None:
+    """Set LOITER as its pilot does, and wait for it."""
+    here.witness.command(index, mav.MAV_CMD_DO_SET_MODE, 1, 4, 3)
+    here.witness.wait(lambda: mode_of(here, index) == LOITER, 2.5, "in LOITER")
+
+
 def test_a_killed_agent_ends_with_its_vehicle_on_the_ground_and_the_others_finish(field: Fielder) -> None:
     here = field(PX4, 3)
     takeoff_m = here.witness.read_parameter(1, TAKEOFF_HEIGHT)
@@ -71,8 +77,7 @@ def test_a_pilot_has_the_vehicle_until_resume(field: Fielder) -> None:
     launched = here.launch(PX4_CONFIG)
     launched.until_phase("TRACK", 3)
     time.sleep(5.0)
-    here.witness.command(1, mav.MAV_CMD_DO_SET_MODE, 1, 4, 3)
-    here.witness.wait(lambda: mode_of(here, 1) == LOITER, 2.5, "in LOITER")
+    take(here, 1)
     until_s = time.monotonic() + 5.0
     while time.monotonic() < until_s:
         assert mode_of(here, 1) == LOITER, "the pilot has it"
@@ -104,8 +109,7 @@ def test_others_make_way_for_who_is_moved_in_hold(field: Fielder) -> None:
     launched = here.launch(PX4_CONFIG, "--set", "mission.kind=hover", "--duration", "30")
     launched.until_phase("TRACK", 3)
     time.sleep(2.0)
-    here.witness.command(2, mav.MAV_CMD_DO_SET_MODE, 1, 4, 3)
-    here.witness.wait(lambda: mode_of(here, 2) == LOITER, 2.5, "in LOITER")
+    take(here, 2)
     time.sleep(2.0)
     vehicle, origin = here.witness.vehicles[2], PX4.origin
     north_m, east_m, down_m = vehicle.pos_ned_m[-1]
@@ -129,8 +133,7 @@ def test_what_a_pilot_holds_on_its_way_up_or_down_is_taken_back(field: Fielder, 
     launched.until_phase(phase, 1)
     vehicle = here.witness.vehicles[0]
     here.witness.wait(lambda: vehicle.height_m() > CLIMBED_M, 30.0, "off the ground")
-    here.witness.command(0, mav.MAV_CMD_DO_SET_MODE, 1, 4, 3)
-    here.witness.wait(lambda: mode_of(here, 0) == LOITER, 2.5, "in LOITER")
+    take(here, 0)
     time.sleep(5.0)
     assert mode_of(here, 0) == LOITER, "the pilot has it"
     assert launched.verb("land").returncode == EXIT_MISSION, "take it back with: resume"

@@ -84,6 +84,7 @@ class MissionChange:
             apart_m=budget.planned_m,
             downwash=setup.separation.downwash,
             ground_z_m=ground_z_m,
+            ground="the place of the take-off",
             volume=setup.volume,
             fence=Geofence(setup.fence_ne_m) if setup.fence_ne_m else None,
         )

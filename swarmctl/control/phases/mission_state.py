@@ -29,7 +29,7 @@ REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
 SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
 PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
 COMPLETED = "completed"  # the outcome of a mission that was flown to its end
-TAKES_BACK_US = 5_000_000  # from an operator's resume, for which the autopilot may take to follow setpoints again
+_TAKES_BACK_US = 5_000_000  # from an operator's resume, for which the autopilot may take to follow setpoints again
 TAKEN_OVER = "pilot or autopilot took over"
 
 
@@ -87,11 +87,12 @@ class MissionState:
         self.duration_us = round(setup.duration_s * 1e6)
         self.phase, self.boots = Phase.CONNECT, 0
         self.outcome = self.outcome_before = self.waits_for = self.stop_verb = ""
-        self.ready_utc_us = self.ordered_begin_utc_us = self.entered_us = self.overridden_us = self.land_by_us = 0
+        self.ready_utc_us = self.ordered_begin_utc_us = self.entered_us = self.overridden_us = 0
+        self.resumed_us = self.land_by_us = 0
         self.begin_utc_us: int | None = None
         self.gone_us: int | None = None
         self.first_tick_us: int | None = None
-        self.requested_us = self.resumed_us = -REQUEST_PERIOD_US
+        self.requested_us = -REQUEST_PERIOD_US
         self.offered: OfferedMission | None = None
         self.had_control = self.pilot_override = self.may_take_control = False
         self.setpoints_stopped = self.airborne = self.landing_seen = False
@@ -189,7 +190,7 @@ class MissionState:
 
     def takes_back(self, now_us: int) -> bool:
         """Return whether the agent is taking the vehicle back, after an operator's resume, and does not have it yet."""
-        return self.may_take_control and not self.had_control and now_us - self.resumed_us < TAKES_BACK_US
+        return self.may_take_control and not self.had_control and now_us - self.resumed_us < _TAKES_BACK_US
 
     def is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Return whether the vehicle is on the ground and known to be disarmed."""

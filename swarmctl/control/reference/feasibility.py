@@ -50,6 +50,7 @@ class FlightLimits:
     ground_z_m: float | None  # NED z of the ground; None where it is not known
     volume: FlightVolume | None  # that plans keep to
     fence: Fence | None = None  # that autopilots keep their vehicles in
+    ground: str = "sitl.ground_z_m"  # what tells the ground's z, for who reads that a reference is below it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +125,7 @@ def _rules(
     ]
     if limits.ground_z_m is not None:
         low = pos[:, 2] > limits.ground_z_m - _GROUND_M
-        below = f"less than {_GROUND_M:g} m above the ground at {limits.ground_z_m:.4g} m (NED)"
+        below = f"less than {_GROUND_M:g} m above the ground at {limits.ground} = {limits.ground_z_m:.4g} (NED)"
         ground = f"the reference is at z = {{}} m, {below}"
         rules.append(_Rule(broken=low & finite, said=ground, values=pos[:, 2]))
     if limits.volume is not None:

@@ -13,9 +13,8 @@ from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, Vehicl
 
 def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
     """Request the climb, and wait until the vehicle hovers; a hold interrupts it."""
-    climbed = mission.climb.update(inputs, state)
-    if mission.may_take_control and mission.climb.cut_short:  # given back in whatever mode it hovers
-        climbed = True
+    given_back = mission.may_take_control and mission.climb.cut_short  # in whatever mode it hovers
+    climbed = mission.climb.update(inputs, state) or given_back
     if climbed and not mission.held:
         mission.enter(Phase.GOTO_START, inputs.now_us)
         return []
