@@ -27,7 +27,7 @@ from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER
-from swarmctl.core.types import Phase
+from swarmctl.core.types import FlightMode, Landed, Phase
 from tests import builders
 from tests.unit.bus.test_topics import STATUS
 
@@ -402,3 +402,31 @@ def test_who_is_done_or_has_left_is_no_company() -> None:
     assert bench.world_model.has_company(bench.clock.utc_us())
     bench.peer.close()
     assert not bench.world_model.has_company(bench.clock.utc_us())
+
+
+@pytest.mark.parametrize(
+    ("mode", "speed_m_s", "landed", "grows"),
+    [
+        (FlightMode.HOLD, 0.1, Landed.IN_AIR, False),
+        (FlightMode.HOLD, 2.0, Landed.IN_AIR, True),
+        (FlightMode.LAND, 0.1, Landed.IN_AIR, True),
+        (FlightMode.HOLD, 2.0, Landed.ON_GROUND, False),
+    ],
+    ids=["rests in hold", "is moved in hold", "descends", "stands"],
+)
+def test_the_margin_of_who_is_done_grows_with_age_while_its_vehicle_moves(
+    mode: FlightMode, speed_m_s: float, landed: Landed, grows: bool
+) -> None:
+    bench = Bench()
+    bench.say_path()
+    bench.say_status(phase=Phase.DONE, flight_mode=mode, ground_speed_m_s=speed_m_s, landed=landed)
+    bench.tick()
+
+    def apart_m() -> float:
+        there = HERE + np.array([9.0, 0.0, 0.0])
+        (body,) = bench.world_model.bodies(there, bench.clock.utc_us(), 0.1, 0.1, committed_peers={})
+        return body.apart_m
+
+    before_m = apart_m()
+    bench.clock.advance(500_000)
+    assert (apart_m() > before_m + 0.1) is grows
