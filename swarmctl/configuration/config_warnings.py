@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -56,4 +57,5 @@ def _judged_by_more_than_is_kept(config: Config) -> Iterator[str]:
     if config.separation.mode == "guaranteed" and budget.committed_m < limit_m - _SAME_M:
         keeps = f"separation.radius_m = {budget.radius_m:g}: commitments keep {budget.committed_m:.2f} m"
         fails = f"the flight fails below limits.min_separation_m = {limit_m:g}"
-        yield f"{keeps}, and {fails}; {budget.radius_that_commits_m(limit_m):.2f} m keeps that"
+        enough_m = math.ceil(100.0 * budget.radius_that_commits_m(limit_m) - 1e-6) / 100.0
+        yield f"{keeps}, and {fails}; {enough_m:.2f} m keeps that"

@@ -38,6 +38,12 @@ class VehicleModelParams(Params):
         """Return the lag of the attitude behind its setpoints; None if it follows at once."""
         return Lag(self.attitude_rad_s, self.attitude_damping) if self.attitude_rad_s > 0 else None
 
+    @property
+    def response_s(self) -> float:
+        """Return the time by which accelerations are later than what asks for them: dead time, and lag of a ramp."""
+        lag = self.lag()
+        return self.delay_s + (0.0 if lag is None else lag.ramp_delay_s)
+
     def u_max(self) -> float:
         """Return the largest horizontal part of the body's down axis."""
         return math.sin(self.tilt_max_rad)
@@ -57,8 +63,7 @@ class VehicleModelParams(Params):
             gust_m_s: change of the wind.
             accel_max_m_s2: largest horizontal acceleration of the controller.
         """
-        lag = self.lag()
-        blind_s = _NOTICE_S + self.delay_s + (0.0 if lag is None else lag.ramp_delay_s)
+        blind_s = _NOTICE_S + self.response_s
         if self.drag_1_s == 0.0 or gust_m_s == 0.0:
             return 0.0
         kept = math.exp(-self.drag_1_s * blind_s)

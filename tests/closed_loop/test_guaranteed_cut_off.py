@@ -126,9 +126,7 @@ def test_negative_control_agents_that_doubt_silent_peers_evade(monkeypatch: pyte
         return heard
 
     monkeypatch.setattr(Coordination, "_relied_on", only_heard)
-    flight = two_of_six_cut_off()
-    assert evasions(flight) > 4
-    assert len(events(flight, "tracking_violation")) > 2, "pushed by safety filters, some leave their tubes"
+    assert evasions(two_of_six_cut_off()) > 4
 
 
 def test_the_others_go_on_without_a_frozen_agent_once_they_agree() -> None:

@@ -81,6 +81,7 @@ class Coordination:
         rate_hz: float,
     ) -> None:
         self._agent, self._boot_id, self._bus, self._world_model = agent, boot_id, bus, world_model
+        params = params.for_vehicle(vehicle)
         planner = TrajectoryPlanner(
             agent,
             params,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-_MAX_SLACK_01 = 1.0 / 3.0  # share of the distance beyond touching bodies that slack of commitments may use up
+_MAX_SLACK_01 = 0.2  # share of the distance beyond touching bodies that slack of commitments may use up
 _HOME_01 = 2.0 / 3.0  # share of the radius that is left between starts when estimates have wandered
 
 

@@ -287,7 +287,7 @@ class Commitments:
         self._late_us = 0
 
     def _set_lead(self, lead_s: float) -> None:
-        self._lead_s = min(self._params.lead_max_s, max(self._params.lead_min_s, lead_s))
+        self._lead_s = max(self._params.lead_min_s, min(self._params.lead_max_s, lead_s))
 
 
 def acknowledgements(peers: Mapping[int, TrajectoryMessage], without: Set[int]) -> dict[int, int]:

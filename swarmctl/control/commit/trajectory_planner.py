@@ -51,12 +51,20 @@ class CommitParams(Params):
         0.8, gt=0, le=1
     )  # share of the controller's tilt that plans may use; the rest is for tracking
     period_s: float = Field(0.1, ge=0, le=2)  # least time between two plans
-    lead_min_s: float = Field(0.06, ge=0.02, le=2)  # least time from proposing to flying
+    lead_min_s: float = Field(0.06, ge=0.02, le=2)  # least time from proposing to flying; the vehicle may need more
     lead_max_s: float = Field(1.5, ge=0.1, le=5)  # longest such lead, however late the others answer
     clock_error_max_s: float = Field(1.0, ge=0.01, le=10)  # nothing is proposed while a peer's clock is known less well
     right_of_way_rad: float = Field(1.0, ge=0, le=1.2)  # overrides `separation`: plans with stops lock sooner
     stuck_m: float = Field(1.0, gt=0, le=10)  # overrides `separation`: agents that meet turn while they still move
     follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # tracks commitments to the centimetre
+
+    def for_vehicle(self, vehicle: VehicleModelParams) -> CommitParams:
+        """Return parameters by which a proposal leaves what is committed no sooner than the vehicle can.
+
+        Until the vehicle responds it flies on as before, and is then beside what it has committed to: six PX4s, which
+        respond after 0.28 s, left their tubes 145 times in a flight with a lead of 0.14 s, and 38 times with 0.28 s.
+        """
+        return self.model_copy(update={"lead_min_s": max(self.lead_min_s, vehicle.response_s)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +133,10 @@ class TrajectoryPlanner:
         right_of_way = separation.model_copy(
             update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
         )
+        planning = _planning(mpc, params)
+        self._hardest_m_s2 = planning.accel_max_m_s2
         self._mpc = SwarmMpc(
-            _planning(mpc, params),
+            planning,
             vehicle.model_copy(update={"attitude_rad_s": 0.0}),
             right_of_way,
             agent,
@@ -180,8 +190,16 @@ class TrajectoryPlanner:
         return not self._margin_m(trajectory, utc_us, known, spare_m) >= 0.0
 
     def stopping_from(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> Trajectory:
-        """Return the trajectory that brakes straight ahead from a position (3,) and velocity (3,)."""
-        return stopping(pos_ned_m, vel_ned_m_s, utc_us, self.dt_us, brake_m_s2=self._params.brake_m_s2)
+        """Return the trajectory that brakes straight ahead from a position (3,) and velocity (3,).
+
+        It brakes harder than `CommitParams.brake_m_s2` where it would leave the flight volume otherwise, as hard as
+        plans may.
+        """
+        brake_m_s2 = self._params.brake_m_s2
+        if self._volume is not None:
+            needed_m_s2 = self._volume.braking_m_s2(pos_ned_m, vel_ned_m_s)
+            brake_m_s2 = max(brake_m_s2, min(needed_m_s2, self._hardest_m_s2))
+        return stopping(pos_ned_m, vel_ned_m_s, utc_us, self.dt_us, brake_m_s2=brake_m_s2)
 
     def stopping_candidate(self, committed: Trajectory, brake_us: int, utc_us: int) -> Trajectory:
         """Return the committed trajectory from `utc_us` on, left for straight braking at `brake_us`."""

@@ -32,7 +32,7 @@ def test_the_section_of_a_kind_that_is_not_flown_is_named() -> None:
 def test_commitments_that_keep_less_than_the_flight_is_judged_by_are_named() -> None:
     guaranteed = "separation.mode=guaranteed"
     (said,) = lines(guaranteed)
-    assert said.startswith("separation.radius_m = 0.9: commitments keep 0.80 m, and the flight fails below")
+    assert said.startswith("separation.radius_m = 0.9: commitments keep 0.82 m, and the flight fails below")
     assert said.endswith("limits.min_separation_m = 0.85; 0.95 m keeps that")
     assert lines(guaranteed, "separation.radius_m=0.95") == lines(guaranteed, "limits.min_separation_m=0.8") == []
 

@@ -49,9 +49,9 @@ def test_the_page_lists_every_distance_and_its_numbers() -> None:
 
 
 def test_commitments_leave_room_for_tracking_however_large_the_slack_is() -> None:
-    """Two thirds of the distance beyond touching bodies remain, a half of them for each of two vehicles."""
-    budget = SeparationParams(radius_m=0.9, body_m=0.6, certify_slack_m=5.0).budget
-    assert budget.committed_m == pytest.approx(0.8)
+    """Four fifths of the distance beyond touching bodies remain, a half of them for each of two vehicles."""
+    budget = SeparationParams(radius_m=0.9, body_m=0.65, certify_slack_m=5.0).budget
+    assert budget.committed_m == pytest.approx(0.85)
     assert budget.tube_m == pytest.approx(0.1)
     assert SeparationParams(radius_m=0.5, body_m=0.6).budget.committed_m == 0.5, "there is none to use up"
 

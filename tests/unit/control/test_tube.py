@@ -62,7 +62,7 @@ def test_a_vehicle_that_merely_lags_has_not_lost_its_commitment() -> None:
 
 
 @pytest.mark.parametrize(
-    ("outside_m", "pace_01"), [(-0.1, 1.0), (0.05, 1.0), (0.1, 0.5), (0.15, 0.0), (0.4, 0.0)], ids=str
+    ("outside_m", "pace_01"), [(-0.1, 1.0), (0.03, 1.0), (0.08, 0.5), (0.13, 0.0), (0.4, 0.0)], ids=str
 )
 def test_outside_its_tube_a_vehicle_plans_to_be_slower_and_then_to_stand(outside_m: float, pace_01: float) -> None:
     tube = Tube(NOMINAL_M)

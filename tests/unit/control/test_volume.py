@@ -196,11 +196,11 @@ def test_an_own_controller_that_plans_to_leave_is_not_flown(
 # -- guaranteed separation --------------------------------------------------------------------------------------------
 
 
-def planner(volume: FlightVolume | None = VOLUME) -> TrajectoryPlanner:
+def planner(volume: FlightVolume | None = VOLUME, u_max: float = 0.25) -> TrajectoryPlanner:
     return TrajectoryPlanner(
         0,
         CommitParams(),
-        MpcParams(u_max=0.25),
+        MpcParams(u_max=u_max),
         MODEL,
         SeparationParams(),
         max_keep_outs=1,
@@ -250,6 +250,27 @@ def test_an_agent_that_is_blown_out_commits_to_come_back() -> None:
     after = committed_to(planner(), (6.0, 0.0, -2.0), blown, 30)
     assert float(VOLUME.beyond_m(after.pos_ned_m).max()) <= farthest_m + 0.02
     assert float(VOLUME.beyond_m(after.pos_ned_m[-1])) <= -CERTIFIED_M
+
+
+@pytest.mark.parametrize("to", [(1.0, 0.0), (0.6, -0.8), (0.0, 1.0)])
+@pytest.mark.parametrize(("volume", "is_inside"), [(VOLUME, True), (None, False)])
+def test_what_is_lost_at_speed_is_stopped_inside(
+    volume: FlightVolume | None, is_inside: bool, to: tuple[float, float]
+) -> None:
+    """4 m/s end after 5.3 m at the usual braking; the sides are 4 to 5 m away."""
+    vel = 4.0 * np.array([*to, 0.0])
+    stopped = planner(volume, u_max=0.6).stopping_from(np.array([0.0, 0.0, -2.0]), vel, UTC_US)
+    assert (float(VOLUME.beyond_m(stopped.pos_ned_m).max()) <= -KEPT_M + 1e-6) == is_inside
+    assert np.allclose(np.cross(stopped.pos_ned_m[-1] - stopped.pos_ned_m[0], vel), 0.0, atol=1e-9), "straight ahead"
+
+
+def test_it_is_stopped_no_harder_than_plans_may_and_no_harder_than_needed() -> None:
+    vel, plans = np.array([4.0, 0.0, 0.0]), planner(u_max=0.6)
+    near, away = np.array([4.0, 0.0, -2.0]), np.array([3.0, 0.0, -2.0])
+    hardest_m_s2 = GRAVITY_M_S2 * np.tan(np.arcsin(0.8 * 0.6))
+    assert np.linalg.norm(plans.stopping_from(near, vel, UTC_US).acceleration(UTC_US)) == pytest.approx(hardest_m_s2)
+    outwards = plans.stopping_from(away, -0.5 * vel, UTC_US)
+    assert np.linalg.norm(outwards.acceleration(UTC_US)) == pytest.approx(CommitParams().brake_m_s2)
 
 
 @pytest.mark.parametrize(
