@@ -116,7 +116,8 @@ class ScriptedServices(Services):
             self.stamped_us += [(order.utc_us, now_us - order.utc_us) for order in orders]
             ended = [order for _, payload in bus.receive(ENDED) if (order := decode_command(payload))]
             self.vouched |= {int(order.arguments[PEER]) for order in ended if order.verb == EXCLUDE}
-            if any(order.verb == "land" for order in orders) and self.obeys and i not in self.silent:
+            obeys = self.obeys and i not in self.silent and i not in self.recovered  # what recovers a vehicle lands it
+            if any(order.verb == "land" for order in orders) and obeys:
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:
                 bus.publish(STATUS, status_of(i, self.phases.get(i, self.phase), now_us - self.behind_us, self.held))

@@ -181,7 +181,7 @@ ROWS = tuple(
             "commitments widen with what a vehicle is off",
             "test_gusts.py",
             "vehicles_that_are_blown_out_of_their_tubes_commit_anew_and_keep_apart",
-            "negative_control_vehicles_that_chase_what_they_were_committed_to_touch",
+            "negative_control_vehicles_that_chase_what_they_were_committed_to_come_too_close",
         ),
         (
             "supervisor-deaf",
