@@ -133,17 +133,18 @@ class FlightVolume:
         return self.beyond_m(pos_ned_m, self.params.margin_m)
 
     def braking_m_s2(self, pos_ned_m: Array, vel_ned_m_s: Array) -> float:
-        """Return the deceleration that ends a velocity (3,) at a position (3,) within what plans keep to.
+        """Return the deceleration by which braking straight ahead from a state, (3,) each, ends where plans keep to.
 
-        Faces that the position is outside of already don't count: no deceleration ends inside of them.
+        At speed v it ends after v^2 / 2a. Faces that the position is outside of already don't count: no deceleration
+        ends inside of them.
         """
         room_m = self.normals_ned @ pos_ned_m - self.planned_m
         towards_m_s = -(self.normals_ned @ vel_ned_m_s)
         ahead = (towards_m_s > 0.0) & (room_m > 0.0)
         if not ahead.any():
             return 0.0
-        stop_m_s = float(np.linalg.norm(vel_ned_m_s))
-        return float((0.5 * stop_m_s * towards_m_s[ahead] / room_m[ahead]).max())
+        speed_m_s = float(np.linalg.norm(vel_ned_m_s))
+        return float((0.5 * speed_m_s * towards_m_s[ahead] / room_m[ahead]).max())
 
     def face(self, pos_ned_m: Array) -> str:
         """Return the name of the face that a position (3,) is farthest outside of, or nearest to."""

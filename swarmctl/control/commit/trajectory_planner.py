@@ -62,7 +62,8 @@ class CommitParams(Params):
         """Return parameters by which a proposal leaves what is committed no sooner than the vehicle can.
 
         Until the vehicle responds it flies on as before, and is then beside what it has committed to: six PX4s, which
-        respond after 0.28 s, left their tubes 145 times in a flight with a lead of 0.14 s, and 38 times with 0.28 s.
+        respond after 0.28 s, left tubes of 10 cm 68 to 136 times in a flight with a lead of 0.14 s, and 38 times with
+        0.28 s.
         """
         return self.model_copy(update={"lead_min_s": max(self.lead_min_s, vehicle.response_s)})
 
@@ -192,8 +193,7 @@ class TrajectoryPlanner:
     def stopping_from(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> Trajectory:
         """Return the trajectory that brakes straight ahead from a position (3,) and velocity (3,).
 
-        It brakes harder than `CommitParams.brake_m_s2` where it would leave the flight volume otherwise, as hard as
-        plans may.
+        Where it would leave the flight volume it brakes harder than `CommitParams.brake_m_s2`, up to what plans may.
         """
         brake_m_s2 = self._params.brake_m_s2
         if self._volume is not None:
