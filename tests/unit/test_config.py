@@ -530,7 +530,10 @@ BOX = ("volume.corners_ne_m=[[-6, -6], [6, -6], [6, 6], [-6, 6]]", "volume.floor
         (("controller.kind=pid",), ("controller.kind = 'pid'", "use dmpc")),
         (("separation.tracking_m=0.4", "separation.radius_m=1.2"), ("volume.margin_m = 0.3", "need 0.40 m")),
         (
-            ("separation.gust_m_s=8", "vehicle_model.drag_1_s=1", "controller.mpc.u_max=0.8", "separation.radius_m=3"),
+            (
+                *("separation.gust_m_s=8", "vehicle_model.drag_1_s=1", "separation.radius_m=3"),
+                *("controller.mpc.u_max=0.8", "vehicle_model.tilt_max_rad=1.2"),
+            ),
             ("volume.margin_m = 0.3", "gusts", "need 0."),
         ),
         (("geofence.corners_ne_m=[[-9, -9], [5, -9], [5, 9], [-9, 9]]",), ("volume.corners_ne_m: [[6.0, -6.0]",)),

@@ -11,6 +11,7 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.control.phases.mission_state import MissionState
+from swarmctl.control.reference.approach import approached
 from swarmctl.control.reference.deadlock import Deadlock, DeadlockRecovery
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, Phase, Reference, Sampled
@@ -32,6 +33,7 @@ class ReferenceSelector:
             setup.params.deadlock, setup.agent, setup.separation.budget.radius_m, setup.volume
         )
         self._ahead_s, self._now_and_ahead_s = ahead_s, np.concatenate([[0.0], ahead_s])
+        self._speed_max_m_s = setup.vehicle_model.speed_max_m_s
         self._mission_ned = np.zeros((len(ahead_s) + 1, 3)), np.zeros((len(ahead_s) + 1, 3))  # positions, velocities
         self._reported: Deadlock | None = None
 
@@ -76,19 +78,21 @@ class ReferenceSelector:
         self._recovery.reset()
         self._report(now_us)
 
-    def reference(self) -> tuple[Reference, Reference]:
+    def reference(self, pos_ned_m: Array) -> tuple[Reference, Reference]:
         """Return the reference at the times asked for, (N, 3) each, and the mission's own one now, (1, 3).
 
-        The mission's own one is that which agents share, without the own place around it.
+        The first is approached from the own position (3,) no faster than the vehicle may fly. The mission's own one is
+        that which agents share, without the own place around it.
         """
         pos, vel = self._mission_ned
         now_ref = Reference(pos[:1] - self._mission.place_offset_ned_m, vel[:1], self._yaw_rad)
         if self._recovery.active:
             return Reference(*self._recovery.sample(self._ahead_s), self._yaw_rad), now_ref
-        return Reference(pos[1:], vel[1:], self._yaw_rad), now_ref
+        near = approached(pos[1:], vel[1:], self._ahead_s, pos_ned_m, speed_max_m_s=self._speed_max_m_s)
+        return Reference(*near, self._yaw_rad), now_ref
 
     def desired(self, now_us: int, utc_us: int) -> DesiredReference:
-        """Return the same reference as a function of time, for a planner with another time grid."""
+        """Return the same reference as a function of time, for a planner with another time grid and start."""
         if self._recovery.active:
             return DesiredReference(self._recovery.sample, follows_path=True)
         return DesiredReference(self._follows(now_us, utc_us))

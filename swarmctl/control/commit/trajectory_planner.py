@@ -16,6 +16,7 @@ from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOut, KeepOut
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import AxisWeights, MpcParams, SwarmMpc
+from swarmctl.control.reference.approach import approached
 from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
@@ -130,12 +131,13 @@ class TrajectoryPlanner:
         volume: FlightVolume | None = None,
     ) -> None:
         self._volume, self._budget = volume, separation.budget
-        self._params, self._separation, self._drag_1_s = params, separation, vehicle.drag_1_s
+        self._params, self._separation = params, separation
+        self._drag_1_s, self._speed_max_m_s = vehicle.drag_1_s, vehicle.speed_max_m_s
         right_of_way = separation.model_copy(
             update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
         )
         planning = _planning(mpc, params)
-        self._hardest_m_s2 = planning.accel_max_m_s2
+        self._hardest_m_s2 = planning.accel_max_m_s2(vehicle)
         self._mpc = SwarmMpc(
             planning,
             vehicle.model_copy(update={"attitude_rad_s": 0.0}),
@@ -252,7 +254,7 @@ class TrajectoryPlanner:
             cos_tilt=max(_LEAST_COS_TILT, math.sqrt(1.0 - float(virtual_control[:2] @ virtual_control[:2]))),
             virtual_control=virtual_control,
         )
-        wanted = Reference(*now.desired.reference(1e-6 * (ahead_us + (now.begin_us - now.utc_us))), 0.0)
+        wanted = self._wanted(now, 1e-6 * ahead_us, pos[0])
         guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if now.desired.follows_path else pos
         agents = [message.agent for message in now.peers.values() for _ in message.followed]
         keep_outs = self._keep_outs(now.followed, agents, now.begin_us, steps)
@@ -268,6 +270,13 @@ class TrajectoryPlanner:
             )
         )
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
+
+    def _wanted(self, now: Situation, ahead_s: Array, begin_ned_m: Array) -> Reference:
+        """Return the desired reference at times after the plan's begin, approached from there as fast as allowed."""
+        motion = now.desired.reference(ahead_s + 1e-6 * (now.begin_us - now.utc_us))
+        if not now.desired.follows_path:
+            motion = approached(*motion, ahead_s, begin_ned_m, speed_max_m_s=self._speed_max_m_s)
+        return Reference(*motion, 0.0)
 
     def _virtual_control(self, committed: Trajectory, now: Situation) -> Array:
         """Return the virtual controls (3,) that fly the committed trajectory when the plan begins."""

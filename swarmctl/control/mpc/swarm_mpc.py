@@ -61,11 +61,10 @@ class MpcParams(Params):
     terminal_xy: Terminal = "none"  # the same for x-y
     qp: QpParams = QpParams()
 
-    @property
-    def accel_max_m_s2(self) -> float:
+    def accel_max_m_s2(self, vehicle: VehicleModelParams) -> float:
         """Return the largest horizontal acceleration in level flight, by tilt and thrust."""
         by_thrust = math.sqrt(self.thrust_max_m_s2**2 - GRAVITY_M_S2**2)
-        return min(by_thrust, GRAVITY_M_S2 * math.tan(math.asin(self.u_max)))
+        return min(by_thrust, GRAVITY_M_S2 * math.tan(math.asin(min(self.u_max, vehicle.u_max()))))
 
     def vertical(self) -> Axis:
         """Return the z axis: its input is thrust over mass, realised at once."""

@@ -196,12 +196,14 @@ def test_an_own_controller_that_plans_to_leave_is_not_flown(
 # -- guaranteed separation --------------------------------------------------------------------------------------------
 
 
-def planner(volume: FlightVolume | None = VOLUME, u_max: float = 0.25) -> TrajectoryPlanner:
+def planner(
+    volume: FlightVolume | None = VOLUME, u_max: float = 0.25, model: VehicleModelParams = MODEL
+) -> TrajectoryPlanner:
     return TrajectoryPlanner(
         0,
         CommitParams(),
         MpcParams(u_max=u_max),
-        MODEL,
+        model,
         SeparationParams(),
         max_keep_outs=1,
         stopwatch_ns=lambda: 0,
@@ -264,10 +266,13 @@ def test_what_is_lost_at_speed_is_stopped_inside(
     assert np.allclose(np.cross(stopped.pos_ned_m[-1] - stopped.pos_ned_m[0], vel), 0.0, atol=1e-9), "straight ahead"
 
 
-def test_it_is_stopped_no_harder_than_plans_may_and_no_harder_than_needed() -> None:
-    vel, plans = np.array([4.0, 0.0, 0.0]), planner(u_max=0.6)
+@pytest.mark.parametrize(("tilt_max_rad", "u_max"), [(0.6, 0.8 * 0.6), (0.3, np.sin(0.3))])
+def test_it_is_stopped_no_harder_than_plans_and_vehicle_may_and_no_harder_than_needed(
+    tilt_max_rad: float, u_max: float
+) -> None:
+    vel, plans = np.array([4.0, 0.0, 0.0]), planner(u_max=0.6, model=VehicleModelParams(tilt_max_rad=tilt_max_rad))
     near = np.array([4.0, 0.0, -2.0])
-    hardest_m_s2 = GRAVITY_M_S2 * np.tan(np.arcsin(0.8 * 0.6))
+    hardest_m_s2 = GRAVITY_M_S2 * np.tan(np.arcsin(u_max))
     assert np.linalg.norm(plans.stopping_from(near, vel, UTC_US).acceleration(UTC_US)) == pytest.approx(hardest_m_s2)
     inwards = plans.stopping_from(near, -0.5 * vel, UTC_US)
     assert np.linalg.norm(inwards.acceleration(UTC_US)) == pytest.approx(CommitParams().brake_m_s2)

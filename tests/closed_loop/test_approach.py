@@ -1,0 +1,46 @@
+"""Who is away from its reference approaches it at `vehicle_model.speed_max_m_s` at most.
+
+From rest a plan makes up for the time lost: it exceeds that by up to a tenth for a moment, and settles at it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from swarmctl.core.types import Phase
+from tests.closed_loop.conftest import Flight, Fly
+from tests.closed_loop.test_operator import phase
+
+SPEED_M_S = 3.0
+TO_NED_M = [25.0, 0.0, -5.0]  # where the reference begins, 25 m from the start, and stays
+
+
+def fly_there(fly: Fly, speed_max_m_s: float, mode: str) -> Flight:
+    return fly(
+        "swarm.agents=1",
+        "sitl.start=air",
+        "start.positions_ned_m=[[0,0,-3]]",
+        "mission.kind=waypoints",
+        "mission.duration_s=15",
+        f"mission.waypoints.lists=[{{points_ned_m=[{TO_NED_M},[25.0,0.5,-5.0]]}}]",
+        f"vehicle_model.speed_max_m_s={speed_max_m_s}",
+        f"separation.mode={mode}",
+        until=lambda running: phase(running) > Phase.TRACK,
+    )
+
+
+def fastest_m_s(flight: Flight) -> float:
+    steps_m = np.linalg.norm(np.diff(flight.pos_ned_m[:, 0], axis=0), axis=1)
+    return float((steps_m / np.diff(flight.t_s)).max())
+
+
+@pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
+def test_a_reference_far_away_is_approached_no_faster_than_allowed(fly: Fly, mode: str) -> None:
+    flight = fly_there(fly, SPEED_M_S, mode)
+    assert fastest_m_s(flight) < 1.1 * SPEED_M_S
+    assert np.abs(flight.pos_ned_m[-1, 0] - [25.0, 0.5, -5.0]).max() < 0.1
+
+
+def test_negative_control_without_that_limit_it_is_flown_to_as_fast_as_tilt_allows(fly: Fly) -> None:
+    assert fastest_m_s(fly_there(fly, 100.0, "best_effort")) > 2.0 * SPEED_M_S
