@@ -95,7 +95,7 @@ def _setup_of(config: Config, agent: int, boot_id: int, originals: Mapping[str, 
         vehicle_model=config.model_of(agent),
         max_obstacles=min(max(1, len(config.obstacles)), config.separation.max_obstacles),
         volume=config.volume.flight_volume(),
-        fence_ne_m=config.geofence.corners_ne_m,
+        fence=config.geofence.area(),
         drift_m=config.drift_m,
         originals=originals,
     )

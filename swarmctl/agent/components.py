@@ -24,7 +24,6 @@ from swarmctl.control.phases.mission_state import MissionSetup, MissionState
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.trajectory import grid
-from swarmctl.mavlink.geofence import is_inside
 from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
 Stopwatch = Callable[[], int]  # returns a running time [ns]
@@ -191,7 +190,7 @@ def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
         start_ned_m=setup.starts_ned_m[setup.agent],
         duration_s=setup.mission.duration_s,
         reference=reference,
-        contains=lambda at_ne_m: not setup.fence_ne_m or is_inside(at_ne_m, setup.fence_ne_m),
+        contains=lambda at_ne_m: setup.fence is None or setup.fence.contains(at_ne_m),
         volume=setup.volume,
     )
     return MissionStateMachine(setup.params.state_machine, mission)

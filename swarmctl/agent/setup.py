@@ -23,6 +23,7 @@ from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array
+from swarmctl.mavlink.geofence import Geofence
 
 
 class AgentParams(Params):
@@ -61,7 +62,7 @@ class AgentSetup:
     vehicle_model: VehicleModelParams
     max_obstacles: int
     volume: FlightVolume | None  # to stay in
-    fence_ne_m: tuple[tuple[float, float], ...]  # corners of the geofence; none: no fence
+    fence: Geofence | None  # in which autopilots keep their vehicles; None: no fence
     drift_m: float  # by a gust of `separation.gust_m_s`
     originals: Mapping[str, int | float]  # of parameters that an ended agent has changed, whose vehicle this one lands
 

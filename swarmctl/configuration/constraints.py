@@ -16,7 +16,7 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import FARTHEST_M
-from swarmctl.mavlink.geofence import GeofenceParams, is_inside
+from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.transport import Endpoint, parse_url
 
 _PAIRS_SHOWN = 3
@@ -77,14 +77,14 @@ def volume_problems(
     drift_m: float,
 ) -> Iterator[str]:
     """Yield what does not go with the flight volume."""
-    corners, fence = volume.corners_ne_m, geofence.corners_ne_m
+    corners, fence = volume.corners_ne_m, geofence.area()
     yield from volume.problems(starts_ned_m, separation.tracking_m + drift_m)
     if corners and not (controller.keeps_volume or separation.mode == "guaranteed"):
         yield (
             f"controller.kind = {controller.kind!r} with a volume: it does not plan, and would fly out of it; "
             "use dmpc, dmpc3 or mpc"
         )
-    beyond = [list(corner) for corner in corners if fence and not is_inside(corner, fence)]
+    beyond = [list(corner) for corner in corners if fence and not fence.contains(corner)]
     if beyond:
         yield f"volume.corners_ne_m: {beyond} are outside of geofence.corners_ne_m; move the corners or the fence"
 

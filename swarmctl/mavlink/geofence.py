@@ -13,6 +13,7 @@ from swarmctl.core.types import Array
 
 _Side = tuple[Vec2, Vec2]  # begin and end
 _LEAST_CORNERS = 3
+_ROUNDING_M = 1e-6
 
 
 class GeofenceParams(Params):
@@ -22,11 +23,11 @@ class GeofenceParams(Params):
 
     def problems(self, starts_ned_m: Sequence[tuple[float, float, float]]) -> Iterator[str]:
         """Yield what is wrong with the fence, given the start (north, east, down) [m] of every agent."""
-        corners = self.corners_ne_m
         if problem := self._form_problem():
             yield problem
             return
-        outside = [agent for agent, start in enumerate(starts_ned_m) if corners and not is_inside(start[:2], corners)]
+        area = self.area()
+        outside = [agent for agent, start in enumerate(starts_ned_m) if area and not area.contains(start[:2])]
         if outside:
             yield f"geofence.corners_ne_m: the starts of agents {outside} lie outside; move the corners or the starts"
 
@@ -82,15 +83,9 @@ class Geofence:
             beyond_m[~inside] = np.minimum(beyond_m[~inside], distance_m)
         return beyond_m
 
-
-def is_inside(at_ne_m: tuple[float, float], corners_ne_m: Sequence[tuple[float, float]]) -> bool:
-    """Return whether a position lies inside a polygon, by the number of edges that a ray to the east crosses."""
-    north, east = at_ne_m
-    inside = False
-    for (n0, e0), (n1, e1) in zip(corners_ne_m, [*corners_ne_m[1:], corners_ne_m[0]], strict=True):
-        if (n0 > north) != (n1 > north) and east < e0 + (north - n0) / (n1 - n0) * (e1 - e0):
-            inside = not inside
-    return inside
+    def contains(self, at_ne_m: Sequence[float]) -> bool:
+        """Return whether a position (2,) lies in it or on its border."""
+        return bool(self.beyond_m(np.array([at_ne_m], dtype=np.float64))[0] <= _ROUNDING_M)
 
 
 def _sides(corners_ne_m: Sequence[Vec2]) -> list[_Side]:

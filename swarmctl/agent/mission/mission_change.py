@@ -17,7 +17,6 @@ from swarmctl.control.phases.trajectories import OfferedMission
 from swarmctl.control.reference.feasibility import FlightLimits, infeasible
 from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.operator_verbs import BEGIN, MISSION, Order
-from swarmctl.mavlink.geofence import Geofence
 
 _KEPT = 4  # newest missions
 _SAMPLES = 2000  # of the reference: two milliseconds of a tick
@@ -86,7 +85,7 @@ class MissionChange:
             ground_z_m=ground_z_m,
             ground="the place of the take-off",
             volume=setup.volume,
-            fence=Geofence(setup.fence_ne_m) if setup.fence_ne_m else None,
+            fence=setup.fence,
         )
         problems = list(infeasible([reference], [setup.vehicle_model], limits, most_samples=_SAMPLES))
         if problems:
