@@ -254,7 +254,7 @@ class TrajectoryPlanner:
             cos_tilt=max(_LEAST_COS_TILT, math.sqrt(1.0 - float(virtual_control[:2] @ virtual_control[:2]))),
             virtual_control=virtual_control,
         )
-        wanted = self._wanted(now, 1e-6 * ahead_us, pos[0])
+        wanted = self._wanted(now, ahead_us, pos[0])
         guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if now.desired.follows_path else pos
         agents = [message.agent for message in now.peers.values() for _ in message.followed]
         keep_outs = self._keep_outs(now.followed, agents, now.begin_us, steps)
@@ -271,11 +271,11 @@ class TrajectoryPlanner:
         )
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
 
-    def _wanted(self, now: Situation, ahead_s: Array, begin_ned_m: Array) -> Reference:
+    def _wanted(self, now: Situation, ahead_us: Array, begin_ned_m: Array) -> Reference:
         """Return the desired reference at times after the plan's begin, approached from there as fast as allowed."""
-        motion = now.desired.reference(ahead_s + 1e-6 * (now.begin_us - now.utc_us))
+        motion = now.desired.reference(1e-6 * (ahead_us + (now.begin_us - now.utc_us)))
         if not now.desired.follows_path:
-            motion = approached(*motion, ahead_s, begin_ned_m, speed_max_m_s=self._speed_max_m_s)
+            motion = approached(*motion, 1e-6 * ahead_us, begin_ned_m, speed_max_m_s=self._speed_max_m_s)
         return Reference(*motion, 0.0)
 
     def _virtual_control(self, committed: Trajectory, now: Situation) -> Array:

@@ -1,4 +1,4 @@
-"""The way to a reference from away from it: no faster than the vehicle may fly.
+"""The way to a reference from far away: no faster than the vehicle may fly.
 
 A controller that minimises distances flies to a reference 30 m away as fast as it can, however slow the reference is.
 """
@@ -9,14 +9,16 @@ import numpy as np
 
 from swarmctl.core.types import Array
 
+_FAR_S = 0.8  # at the largest speed: what is nearer is braked for
+
 
 def approached(
     pos_ned_m: Array, vel_ned_m_s: Array, ahead_s: Array, from_ned_m: Array, *, speed_max_m_s: float
 ) -> tuple[Array, Array]:
-    """Return a reference, positions and velocities (N, 3) each, as far as it can be reached by then.
+    """Return a reference, positions and velocities (N, 3) each; of one that is far away, what can be reached by then.
 
-    What is out of reach is replaced by the place on the straight way there that the largest speed leads to: a vehicle
-    that already flies at it is then on its reference.
+    The rest is replaced by the straight way there at the largest speed: a vehicle that already flies as fast is then on
+    its reference.
 
     Args:
         pos_ned_m, vel_ned_m_s: reference (N, 3).
@@ -25,14 +27,11 @@ def approached(
         speed_max_m_s: largest speed.
     """
     way_ned_m = pos_ned_m - from_ned_m
-    reach_m = speed_max_m_s * ahead_s
-    squared_m2 = (way_ned_m * way_ned_m).sum(axis=1)
-    if (squared_m2 <= reach_m * reach_m).all():
+    far_m = np.sqrt((way_ned_m * way_ned_m).sum(axis=1))
+    if (far_m <= speed_max_m_s * np.maximum(ahead_s, _FAR_S)).all():
         return pos_ned_m, vel_ned_m_s
-    far_m = np.sqrt(squared_m2)
-    beyond = far_m > reach_m
-    way_ned_m[beyond] /= far_m[beyond, None]
+    beyond = far_m > speed_max_m_s * ahead_s
     pos, vel = pos_ned_m.copy(), vel_ned_m_s.copy()
-    pos[beyond] = from_ned_m + reach_m[beyond, None] * way_ned_m[beyond]
-    vel[beyond] = speed_max_m_s * way_ned_m[beyond]
+    vel[beyond] = way_ned_m[beyond] * (speed_max_m_s / far_m[beyond, None])
+    pos[beyond] = from_ned_m + vel[beyond] * ahead_s[beyond, None]
     return pos, vel
