@@ -137,6 +137,7 @@ class Lockstep:
         self.world.faults.on_event = self._on_fault
         self._operator = self.hub.connect(topics.OPERATOR, {})
         self._own = dict(own or {})
+        self._starts = [0] * agents  # of further processes
         self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
         self.starved: dict[int, int] = {}  # agent -> its processor executes one tick out of this many
@@ -150,11 +151,11 @@ class Lockstep:
         stamp = {"utc_us": self.clock.utc_us(), "t_us": self.clock.now_us(), "source": "sitl", "event": name}
         self.fault_events.append({**stamp, "since_boot_us": t_us, **fields})
 
-    def _agent(self, index: int, transport: Any, starts: int = 0) -> Agent:
+    def _agent(self, index: int, transport: Any) -> Agent:
         log = self.logs[index]
         others = [i for i in range(self.config.swarm.agents) if i != index]
         bus = RelayingBus(self.hub.connect(agent_name(index), dict.fromkeys(topics.FOR_AGENTS)), others)
-        boot_id = self.config.seed * 1000 + index + starts * 1_000_000
+        boot_id = self.config.seed * 1000 + index + self._starts[index] * 1_000_000
         config = self._own.get(index, self.config)
         key = self._keys[index]
         return make_agent(
@@ -200,8 +201,13 @@ class Lockstep:
         """End an agent's process and start another that only lands its vehicle, as a launch does with a frozen one."""
         self.kill(index)
         self.frozen.discard(index)
-        self.agents[index] = self._agent(index, self.links[index][0], starts=1)
+        self.start_again(index)
         self.command("land", index)
+
+    def start_again(self, index: int) -> None:
+        """Start another process for an agent that was killed: it finds its vehicle where it is."""
+        self._starts[index] += 1
+        self.agents[index] = self._agent(index, self.links[index][0])
 
     def command(self, verb: str, agent: int = -1, **arguments: float) -> None:
         """Send an operator's order, as a verb does."""

@@ -44,7 +44,7 @@ def crashes_twice(scene: Scene) -> None:
 
     def goes_on(scene: Scene) -> None:
         if lockstep.agents[VICTIM] is None and 1.5 < scene.since_s < 2.0:
-            lockstep.agents[VICTIM] = lockstep._agent(VICTIM, lockstep.links[VICTIM][0], starts=1)
+            lockstep.start_again(VICTIM)
         elif lockstep.agents[VICTIM] is not None and scene.since_s > 3.4:
             lockstep.kill(VICTIM)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.conditions.events import Freeze, ScenarioEvent, Split
+from sitl.studies.campaign.conditions.events import Freeze, Restart, ScenarioEvent, Split
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.topics import OPERATOR
 from swarmctl.config import load
@@ -75,3 +75,15 @@ def test_a_frozen_agent_stops_ticking_and_stays_on_the_bus(for_s: float, after: 
     assert flight.alive(0) == EVERYBODY
     flight.until(3.0)
     assert flight.ticks(1) == before + after
+
+
+def test_a_process_that_dies_is_started_again_as_another_one() -> None:
+    flight = Flight(Restart(1, 4.0, 1.0))
+    flight.until(3.9)
+    before = flight.lockstep.agents[1]
+    assert before is not None and NAMES[1] in flight.alive(0)
+    flight.until(4.9)
+    assert flight.lockstep.agents[1] is None and NAMES[1] not in flight.alive(0)
+    flight.until(6.0)
+    assert flight.lockstep.agents[1] not in (None, before) and NAMES[1] in flight.alive(0)
+    assert flight.heard_us(0, 1) < 300_000

@@ -17,6 +17,7 @@ from sitl.studies.campaign.conditions.events import (
     Freeze,
     OneWayCut,
     Recovery,
+    Restart,
     ScenarioEvent,
     SimulatorFault,
     Split,
@@ -92,6 +93,12 @@ def _freeze(rng: np.random.Generator, layout: Layout, for_s: float) -> Layout:
     return _with(_set(layout, "sitl.start=ground"), events, lost={victim})  # where it lands
 
 
+def _restarts(rng: np.random.Generator, layout: Layout, after_s: float) -> Layout:
+    """Start one agent's process again, which lands the vehicle: no agent takes one back from a failsafe by itself."""
+    victim, at_s = int(rng.integers(layout.agents)), float(rng.uniform(*_BEGINS_S))
+    return _with(_set(layout, "sitl.start=ground"), [Restart(victim, at_s, after_s)], lost={victim})
+
+
 def _steps(rng: np.random.Generator, layout: Layout, wind_m_s: float) -> Layout:
     return _on_each(rng, layout, "wind", wind_m_s)
 
@@ -158,6 +165,9 @@ DISTURBANCES: dict[str, Disturbance] = {
         title="messages are late by chance and overtake each other", draw=_jitter, strength=100.0, unit="ms"
     ),
     "freeze": Disturbance(title="one agent's process stops", draw=_freeze, strength=math.inf, unit="s"),
+    "restarts": Disturbance(
+        title="one agent's process dies, and another one is started", draw=_restarts, strength=1.0, unit="s"
+    ),
     "steps": Disturbance(
         title="a wind of its own hits every vehicle from one instant to the next", draw=_steps, strength=8.0, unit="m/s"
     ),

@@ -120,6 +120,20 @@ class Freeze(_Episode):
         lockstep.frozen.discard(self._agent)
 
 
+class Restart(_Episode):
+    """An agent's process dies, and another one is started for its vehicle after a while."""
+
+    def __init__(self, agent: int, at_s: float, for_s: float) -> None:
+        super().__init__(at_s, for_s)
+        self._agent = agent
+
+    def _begin(self, lockstep: Lockstep) -> None:
+        lockstep.kill(self._agent)
+
+    def _end(self, lockstep: Lockstep) -> None:
+        lockstep.start_again(self._agent)
+
+
 class Recovery(_Episode):
     """The supervisor of an agent's host ends its process, and another one lands its vehicle."""
 
