@@ -108,7 +108,7 @@ class Config(Params):
         """Return how far a gust of `separation.gust_m_s` blows the vehicle that it blows farthest."""
         gust_m_s, mpc = self.separation.gust_m_s, self.controller.mpc
         models = [self.vehicle_model, *(vehicle.model for vehicle in self.vehicles if vehicle.model is not None)]
-        return max(model.drift_m(gust_m_s, mpc.accel_max_m_s2(model)) for model in models)
+        return max(mpc.drift_m(gust_m_s, model) for model in models)
 
     def starts_ned_m(self) -> tuple[tuple[float, float, float], ...]:
         """Return the start position of every agent, shared NED [m]."""

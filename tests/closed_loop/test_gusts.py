@@ -48,15 +48,18 @@ def track_in_wind(config: Config, wind: SimulatorFault, for_s: float) -> Lockste
 
 
 @pytest.mark.parametrize("gust_m_s", [4.0, 8.0])
-def test_a_sudden_wind_blows_a_hovering_vehicle_no_farther_than_distances_leave_room_for(gust_m_s: float) -> None:
+@pytest.mark.parametrize(("towards_deg", "least_01"), [(0.0, 0.9), (30.0, 0.7)])  # tilt is bounded along each axis
+def test_a_sudden_wind_blows_a_hovering_vehicle_no_farther_than_distances_leave_room_for(
+    gust_m_s: float, towards_deg: float, least_01: float
+) -> None:
     config = load(X500, [*HOVER, "swarm.agents=1", f"separation.gust_m_s={gust_m_s}"])
-    wind = SimulatorFault(FaultParams(kind="wind", vehicle=0, value=gust_m_s, towards_deg=30.0), 2.0)
+    wind = SimulatorFault(FaultParams(kind="wind", vehicle=0, value=gust_m_s, towards_deg=towards_deg), 2.0)
     flight = track_in_wind(config, wind, 6.0)
     ticks = flight.logs[0].ticks
     begin_us = ticks["t_us"][ticks["phase"] == Phase.TRACK][0]
     places_m = flight.truth["pos_ned_m"][flight.truth["t_us"] >= begin_us]
     drifted_m = np.linalg.norm(places_m - places_m[0], axis=1).max()
-    assert 0.8 * config.drift_m < drifted_m <= config.drift_m
+    assert least_01 * config.drift_m < drifted_m <= config.drift_m
 
 
 def separation_blown_together_m(wind_m_s: float, apart_m: float) -> float:
@@ -80,12 +83,12 @@ def test_refused_plans_that_come_less_close_than_older_ones_are_flown(
 
 
 def blown_farther_than_expected(*sets: str) -> CollisionMonitor:
-    """Six vehicles swap with room for gusts of 4 m/s; each is hit by a wind of 8 m/s of its own in the first 4 s.
+    """Six vehicles swap with room for gusts of 3.65 m/s; each is hit by a wind of 8 m/s of its own in the first 4 s.
 
     That is more than is guaranteed: what is shown is that the reaction makes the difference in one flight, not in all.
     Of ten flights drawn one touches with it, and without it; means 1.28 and 1.01 m.
     """
-    settings = " ".join(("separation.gust_m_s=4", *sets))
+    settings = " ".join(("separation.gust_m_s=3.65", *sets))
     cell = replace(GUARANTEED_SWAP, agents=6, airframe="x500", disturbance="steps:8", sets=settings)
     flight = TrialFlight(Trial(cell, 6), replace(drawn(cell, 6), limit_s=8.0))
     flight.run()

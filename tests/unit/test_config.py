@@ -288,7 +288,8 @@ def test_duplicate_sysid_wrong_url_and_missing_vehicle_are_named(tmp_path: Path)
     ("overrides", "said"),
     [
         (("separation.gust_m_s=4",), "set vehicle_model.drag_1_s"),
-        (("separation.gust_m_s=8", "vehicle_model.drag_1_s=1.0"), "gusts of 8 m/s"),
+        (("separation.gust_m_s=8", "vehicle_model.drag_1_s=1.0"), "gust_m_s = 8: no radius suffices"),
+        (("separation.gust_m_s=1", "vehicle_model.drag_1_s=1.0", "separation.radius_m=0.56"), "gusts of 1 m/s"),
     ],
 )
 def test_gusts_need_a_drag_and_room(overrides: tuple[str, ...], said: str) -> None:

@@ -149,6 +149,12 @@ def radius_problem(params: SeparationParams, accuracy_m: float, drift_m: float) 
     needed_m = params.budget.required_m(accuracy_m, drift_m)
     if params.allow_small_radius or params.radius_m >= needed_m:
         return ""
+    if math.isinf(drift_m):
+        return (
+            f"separation.gust_m_s = {params.gust_m_s:g}: no radius suffices, as a vehicle cannot stand in such a wind. "
+            "Lower it, or allow more tilt (controller.mpc.u_max, vehicle_model.tilt_max_rad) and thrust "
+            "(controller.mpc.thrust_max_m_s2)"
+        )
     gust = f" and gusts of {params.gust_m_s:g} m/s, each {drift_m:.2f} m," if drift_m else ""
     return (
         f"separation.radius_m = {params.radius_m:g}: body {params.body_m:g} m, tracking {params.tracking_m:g} m and an "

@@ -66,6 +66,11 @@ class MpcParams(Params):
         by_thrust = math.sqrt(self.thrust_max_m_s2**2 - GRAVITY_M_S2**2)
         return min(by_thrust, GRAVITY_M_S2 * math.tan(math.asin(min(self.u_max, vehicle.u_max()))))
 
+    def drift_m(self, gust_m_s: float, vehicle: VehicleModelParams) -> float:
+        """Return how far a sudden wind blows a vehicle under this controller; see `VehicleModelParams.drift_m`."""
+        at_once_m_s2 = GRAVITY_M_S2 * min(self.u_max, vehicle.u_max())
+        return vehicle.drift_m(gust_m_s, at_once_m_s2=at_once_m_s2, accel_max_m_s2=self.accel_max_m_s2(vehicle))
+
     def vertical(self) -> Axis:
         """Return the z axis: its input is thrust over mass, realised at once."""
         w = self.z

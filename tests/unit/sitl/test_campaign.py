@@ -166,7 +166,7 @@ def test_the_strength_of_a_disturbance_is_chosen() -> None:
 
 
 def test_another_airframe_and_its_gusts_take_more_room() -> None:
-    sets = {"": 0.9, "separation.gust_m_s=8": 3.39}
+    sets = {"": 0.9, "separation.gust_m_s=8": 4.01}
     for text, radius_m in sets.items():
         cell = replace(SWAP, airframe="x500", sets=text)
         config = config_of(cell, 1, drawn(cell, 1), 6)
