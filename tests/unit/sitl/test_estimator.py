@@ -175,3 +175,27 @@ def test_a_loitering_vehicle_wanders_as_its_estimate_does() -> None:
         spread_m[estimator] = float(np.ptp(np.array(kept), axis=0).max())
     assert 0.1 < spread_m["gps"] < 1.5
     assert spread_m["exact"] < 0.02
+
+
+def test_without_gps_the_error_accelerates_in_the_air_and_rests_on_the_ground() -> None:
+    clock = SimClock()
+    world = SitlWorld(SimulatorConfig(vehicles=1, physics_hz=HZ), [pipe_pair(clock.now_us)[0]])
+    estimator, truth_m = world.estimator, world.plant.pos_ned_m[:, 0].copy()
+
+    def off_m(seconds: float, *, on_ground: bool) -> float:
+        world.plant.contact[:] = on_ground
+        for _ in range(round(seconds * HZ)):
+            estimator.advance()
+        estimate = estimator.of(0, 0)
+        error_m = float(np.linalg.norm(np.array(estimate.pos_ned_m) - truth_m))
+        assert estimate.pos_accuracy_m[0] == pytest.approx(error_m, abs=0.02)
+        return error_m
+
+    estimator.lose_gps(0)
+    assert off_m(5.0, on_ground=True) == 0.0
+    assert off_m(10.0, on_ground=False) == pytest.approx(0.5 * 0.05 * 10.0**2, rel=0.01)
+    landed_m = off_m(6.0, on_ground=True)
+    assert landed_m == pytest.approx(2.5 + 0.8 * 0.5, abs=0.02)
+    assert off_m(60.0, on_ground=True) == pytest.approx(landed_m, abs=0.01)
+    estimator.find_gps(0)
+    assert off_m(0.1, on_ground=True) == 0.0
