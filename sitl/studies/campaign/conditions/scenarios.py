@@ -97,6 +97,7 @@ _SMALL_M_S, _SMALL_M_S2 = 1.0, 1.0
 _COLUMN_M = 0.3  # radius of a tree
 _POST_RADIUS_M = 0.15
 _HULL_MARGIN_M = 0.15  # planned between a small vehicle's hull and a surface; plans are certified to 0.1 m less
+_GUSTY_M = 4.0  # what an x500 keeps where the wind may change by 8 m/s at once
 _SWAP_S = (1.5, 3.5)  # mission time at which all vehicles are on the way to the middle
 
 
@@ -121,8 +122,15 @@ def _circle(rng: np.random.Generator, agents: int) -> Layout:
     return Layout(size=THESIS, starts_ned_m=line, settings=("mission.kind=circle",), limit_s=25.0)
 
 
-def _swap(rng: np.random.Generator, agents: int, jitter_m: float = _JITTER_M) -> Layout:
-    radius_m = max(4.0, 0.7 * THESIS.radius_m / math.sin(math.pi / agents))
+def _swap(
+    rng: np.random.Generator,
+    agents: int,
+    *,
+    jitter_m: float = _JITTER_M,
+    least_m: float = 4.0,
+    apart_m: float = THESIS.radius_m,
+) -> Layout:
+    radius_m = max(least_m, 0.7 * apart_m / math.sin(math.pi / agents))
     exact = ring(agents, radius_m, float(rng.uniform(0.0, 2.0 * math.pi)))
     starts = exact.copy()
     starts[:, :2] += rng.uniform(-jitter_m, jitter_m, (agents, 2))
@@ -132,6 +140,10 @@ def _swap(rng: np.random.Generator, agents: int, jitter_m: float = _JITTER_M) ->
 
 def _symmetric(rng: np.random.Generator, agents: int) -> Layout:
     return _swap(rng, agents, jitter_m=0.0)
+
+
+def _wide_swap(rng: np.random.Generator, agents: int) -> Layout:
+    return _swap(rng, agents, least_m=7.0, apart_m=_GUSTY_M)
 
 
 def _random(rng: np.random.Generator, agents: int) -> Layout:
@@ -232,6 +244,9 @@ SCENARIOS: dict[str, Scenario] = {
         title="every agent to the opposite side of a circle, starts 5 cm off", draw=_swap, agents=(6, 10), needs=2
     ),
     "symmetric": Scenario(title="the same from a perfect polygon", draw=_symmetric, agents=(6, 10), needs=2),
+    "wide_swap": Scenario(
+        title="a swap on a circle of 7 m or more, with room for what gusts need", draw=_wide_swap, agents=(6,), needs=2
+    ),
     "random": Scenario(
         title="random transitions in 3 x 3 x 2 m, small vehicles", draw=_random, agents=(4, 10, 20), alone=True
     ),
