@@ -104,11 +104,15 @@ class Config(Params):
     limits: LimitParams = LimitParams()
 
     @property
+    def vehicle_models(self) -> list[VehicleModelParams]:
+        """Return the models of all vehicles: the common one, and those of vehicles that have their own."""
+        return [self.vehicle_model, *(vehicle.model for vehicle in self.vehicles if vehicle.model is not None)]
+
+    @property
     def drift_m(self) -> float:
         """Return how far a gust of `separation.gust_m_s` blows the vehicle that it blows farthest."""
         gust_m_s, mpc = self.separation.gust_m_s, self.controller.mpc
-        models = [self.vehicle_model, *(vehicle.model for vehicle in self.vehicles if vehicle.model is not None)]
-        return max(mpc.drift_m(gust_m_s, model) for model in models)
+        return max(mpc.drift_m(gust_m_s, model) for model in self.vehicle_models)
 
     def starts_ned_m(self) -> tuple[tuple[float, float, float], ...]:
         """Return the start position of every agent, shared NED [m]."""
@@ -298,6 +302,7 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
         yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
     yield from parameter_problems(config.agent.autopilot_params)
     yield from config.agent.failsafe.problems()
+    yield from _speed_problems(config)
     if config.sitl.speed != 1.0:
         yield (
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
@@ -309,6 +314,18 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
     yield from path_sharing_problems(config.agent.path_sharing, separation)
     drift_m = config.drift_m if agents > 1 else 0.0
     yield from separation_problems(separation, config.vehicle_model, config.limits, agents, drift_m)
+
+
+def _speed_problems(config: Config) -> Iterator[str]:
+    """Yield which speeds on ways of the agent's own are more than a vehicle may fly."""
+    most_m_s = min(model.speed_max_m_s for model in config.vehicle_models)
+    speeds_m_s = {
+        "agent.state_machine.speed_m_s": config.agent.state_machine.speed_m_s,
+        "agent.deadlock.speed_m_s": config.agent.deadlock.speed_m_s,
+    }
+    for key, speed_m_s in speeds_m_s.items():
+        if speed_m_s > most_m_s:
+            yield f"{key} = {speed_m_s:g}: more than vehicle_model.speed_max_m_s = {most_m_s:g}; lower it to that"
 
 
 def _start_problems(config: Config) -> Iterator[str]:

@@ -12,6 +12,7 @@ from swarmctl.core.types import Array, Plan, PlanStatus
 _DAMPING_1_S = 4.0
 _DAMPING_RAD = 0.5  # damping times lag: more would oscillate
 _ACCEL_MAX_M_S2 = 3.0
+_LEAST_COS_TILT = 0.3  # what thrust is raised for: it is finite whatever tilt the plan begins with
 _TILT_RATE_1_S = 2.5  # of (u_x, u_y): faster attitude changes would saturate rotors
 
 
@@ -41,7 +42,8 @@ def brake_and_hold_plan(
         u = np.clip(
             thrust_vector[:2] / float(np.sqrt(thrust_vector @ thrust_vector)), commanded - slew, commanded + slew
         )
-        thrust = float(thrust_vector[2]) / float(np.sqrt(1.0 - u @ u))  # supports the weight at the commanded tilt
+        cos_tilt = float(np.sqrt(max(_LEAST_COS_TILT**2, 1.0 - float(u @ u))))
+        thrust = float(thrust_vector[2]) / cos_tilt  # supports the weight at the commanded tilt
         virtual_control[k], commanded = (u[0], u[1], thrust), u
         acts = u
         if lag is not None:

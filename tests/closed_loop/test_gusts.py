@@ -19,10 +19,10 @@ from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.commit.tube import Tube
 from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.types import Phase
+from swarmctl.core.types import Mode, Phase
 from swarmctl.simulator_config import FaultParams
 from tests.benches.guaranteed_trials import GUARANTEED_SWAP
-from tests.closed_loop.conftest import ROOT
+from tests.closed_loop.conftest import COARSE, ROOT
 
 X500 = ROOT / "configs" / "x500_circle.toml"
 HOVER = ("sitl.start=air", "mission.kind=hover", "mission.duration_s=8", "sitl.estimator=exact")
@@ -80,6 +80,20 @@ def test_refused_plans_that_come_less_close_than_older_ones_are_flown(
     with_them_m = separation_blown_together_m(wind_m_s, apart_m)
     monkeypatch.setattr(PlanBuffer, "_refused_m", lambda self, *_: -math.inf)
     assert with_them_m > separation_blown_together_m(wind_m_s, apart_m) + 0.04
+
+
+def test_a_vehicle_that_brakes_at_all_tilt_it_has_stays_under_control() -> None:
+    """Both axes together asked for more tilt than there is, and what braking began with had no thrust."""
+    box = "volume={corners_ne_m=[[-3,-3],[3,-3],[3,3],[-3,3]],floor_z_m=-0.5,ceiling_z_m=-8}"
+    place = "start.positions_ned_m=[[0,0,-5]]"
+    wind = SimulatorFault(FaultParams(kind="wind", vehicle=0, value=12.0, towards_deg=40.0, for_s=5.0), 2.0)
+    flight = track_in_wind(
+        load(X500, [*HOVER, *COARSE, "swarm.agents=1", "mission.duration_s=14", place, box]), wind, 8.0
+    )
+    rows = flight.logs[0].ticks
+    assert [event for event in flight.logs[0].events if event["event"] == "setpoint_refused"] == []
+    assert Mode.PILOT_OVERRIDE not in rows["mode"] and Mode.BRAKE in rows["mode"]
+    assert np.linalg.norm(flight.truth["pos_ned_m"][-1, :2]) < 5.0
 
 
 def blown_farther_than_expected(*sets: str) -> CollisionMonitor:

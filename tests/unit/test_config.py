@@ -297,6 +297,13 @@ def test_gusts_need_a_drag_and_room(overrides: tuple[str, ...], said: str) -> No
         load(None, [*overrides])
 
 
+@pytest.mark.parametrize("key", ["agent.state_machine.speed_m_s", "agent.deadlock.speed_m_s"])
+def test_ways_faster_than_a_vehicle_may_fly_are_refused(key: str) -> None:
+    with pytest.raises(ConfigError, match=f"{key} = 3: more than vehicle_model.speed_max_m_s = 2.5"):
+        load(None, ["vehicle_model.speed_max_m_s=2.5", f"{key}=3"])
+    load(None, ["vehicle_model.speed_max_m_s=3", f"{key}=3"])
+
+
 def test_vehicles_beside_the_simulator_are_refused(tmp_path: Path) -> None:
     path = vehicles(tmp_path, "udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")
     (problem,) = refusals(path, "sitl.enabled=true")

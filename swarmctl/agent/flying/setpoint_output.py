@@ -12,7 +12,7 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.mpc.problem import Start
 from swarmctl.control.reference.heading import Heading
-from swarmctl.control.setpoint import setpoint_of
+from swarmctl.control.setpoint import setpoint_of, within_tilt
 from swarmctl.core.frames import euler_from_quat
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import AttitudeSetpoint, Plan, VehicleState
@@ -78,6 +78,7 @@ class SetpointOutput:
             flies=flies,
             committed_peers=committed_peers,
         )
+        virtual_control = within_tilt(virtual_control, self._model)  # what is remembered is what is flown
         if not flies and state is not None:
             self._heading.begin(euler_from_quat(state.q_nb)[2])
         yaw_rad = self._heading.at(now_us, self._references.heading_rad(self._ports.utc_of_us(now_us)))

@@ -167,3 +167,12 @@ def test_the_published_path_is_the_one_a_lagging_vehicle_flies() -> None:
         accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]]))
         pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
         np.testing.assert_allclose(plan.pos_ned_m[k + 1, :2], pos[:2], atol=0.02)
+
+
+@pytest.mark.parametrize("tilt", [(0.85, 0.85), (-0.99, 0.0), (1.0, 1.0)])
+def test_a_plan_from_any_tilt_is_finite(tilt: tuple[float, float]) -> None:
+    begin = start((0.0, 0.0, 0.0), tilt=tilt)
+    for lag in (None, LAG):
+        plan = brake_and_hold_plan(begin, None, np.array([8.0, 8.0, 0.0]), lag, dt_us=50_000, steps=40)
+        assert all(np.isfinite(values).all() for values in (plan.pos_ned_m, plan.vel_ned_m_s, plan.virtual_control))
+        assert plan.virtual_control[:, 2].max() < 9.81 / 0.29

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmctl.control.model import Predictor, VehicleModelParams, acceleration, tilt_rate
-from swarmctl.control.setpoint import VALID_US, setpoint_of
+from swarmctl.control.setpoint import VALID_US, setpoint_of, within_tilt
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned, euler_from_quat, quat_from_body_z
 from swarmctl.core.types import Array, VehicleState
 from tests import builders
@@ -187,3 +187,12 @@ def test_without_the_lag_in_the_model_the_same_vehicle_is_predicted_elsewhere() 
         predictor.sent(-200_000, command)
         believed.append(predictor.start(tilted(0, 0.0, 0.0), 80_000, np.zeros(3), command).vel_ned_m_s[0])
     assert abs(believed[1]) > 4.0 * abs(believed[0])
+
+
+def test_both_axes_together_tilt_no_more_than_the_vehicle_may() -> None:
+    asked = np.array([0.5, -0.5, 12.0])
+    found = within_tilt(asked, MODEL)
+    assert np.hypot(*found[:2]) == pytest.approx(MODEL.u_max()) and MODEL.u_max() < 0.7
+    assert found[0] == -found[1] and found[2] == 12.0
+    within = np.array([0.3, -0.3, 12.0])
+    assert within_tilt(within, MODEL) is within
