@@ -32,7 +32,7 @@ class RunningLaunch(msgspec.Struct, frozen=True):
     run: str
     bus: str
     pid: int
-    started_s: float  # start of the process, UTC; a reused pid has another
+    started_s: float  # start of the process, since the computer's; a reused pid has another
     agents: int
     run_dir: str
     view: str = ""  # address of the live view; "" without one
@@ -60,8 +60,14 @@ def withdraw() -> None:
 
 
 def process_start_s() -> tuple[float, int]:
-    """Return the start time of this process, UTC [s], and its id."""
-    return psutil.Process().create_time(), os.getpid()
+    """Return the start time of this process, since the computer's start [s], and its id."""
+    process = psutil.Process()
+    return _start_s(process), process.pid
+
+
+def _start_s(process: psutil.Process) -> float:
+    """Return when a process has started, since the computer's start: a step of its UTC changes both times alike."""
+    return float(process.create_time() - psutil.boot_time())
 
 
 def find_launch(run: str | None) -> RunningLaunch:
@@ -116,7 +122,7 @@ def runs(launch: RunningLaunch) -> bool:
         process = psutil.Process(launch.pid)
         if process.status() == psutil.STATUS_ZOMBIE:  # it has ended, and its parent has not noticed yet
             return False
-        return abs(process.create_time() - launch.started_s) < _START_TOLERANCE_S
+        return abs(_start_s(process) - launch.started_s) < _START_TOLERANCE_S
     except (psutil.Error, ValueError):
         return False
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
+import psutil
 import pytest
 import typer
 
@@ -402,6 +403,21 @@ def test_the_registry_knows_live_launches_and_forgets_dead_ones(
     with pytest.raises(StartError):
         running_launches.find_launch(None)
     assert list(registry.iterdir()) == []
+
+
+def test_a_launch_is_found_after_the_computers_clock_has_stepped(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    started_s, pid = running_launches.process_start_s()
+    launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(tmp_path))
+    running_launches.announce(launch)
+    booted_s = psutil.boot_time()
+    before_s = psutil.Process().create_time()
+    monkeypatch.setattr("psutil._pslinux.boot_time", lambda: booted_s + 3600.0)
+    assert psutil.Process().create_time() == pytest.approx(before_s + 3600.0), "a step moves both"
+    assert running_launches.find_launch(None) == launch
 
 
 def test_a_note_that_cannot_be_written_stops_neither_the_flight_nor_the_others(
