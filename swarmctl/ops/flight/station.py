@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.json_messages import decode_obstacles
+from swarmctl.bus.messages.json_messages import StatusMessage, decode_obstacles
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.topics import OBSTACLES, TICK
@@ -114,6 +114,7 @@ class SwarmWatch:
         self._recorders = {name: Recorder(directory, agent) for name, agent in self._numbers.items()}
         self._clocks = SenderClocks(note)
         self._flying: set[int] = set()  # agents that were heard between the beginning and the end of a flight
+        self._ended_in_flight: dict[int, str] = {}  # agents whose process has, in words
         self._stepped_s = clock_s()
         self._is_over = False
         self.problems: list[str] = []
@@ -127,8 +128,12 @@ class SwarmWatch:
         for status in self._report.statuses():
             if 0 <= status.agent < len(self._views):
                 view = self._views[status.agent]
+                if view.status is not None and _flies(view.status) and status.boot_id != view.status.boot_id:
+                    in_phase = name_of(Phase, view.status.phase)
+                    ended = f"{agent_name(view.agent)} ended in {in_phase}, and another process took its vehicle over"
+                    self._ended_in_flight.setdefault(view.agent, ended)
                 view.status, view.received_s = status, now_s
-                if status.armed or Phase.STANDBY < status.phase < Phase.DONE:
+                if _flies(status):
                     self._flying.add(status.agent)
         for _, payload in self._bus.receive(OBSTACLES):
             message = decode_obstacles(payload)
@@ -175,9 +180,10 @@ class SwarmWatch:
         }
 
     def _conclude(self, lost: Mapping[int, str]) -> None:
-        """Tell the ends of all agents."""
-        self.problems += lost.values()
-        outcomes = {v.agent: v.status.outcome for v in self._views if v.status is not None and v.agent not in lost}
+        """Tell the ends of all agents; of one that was taken over in flight that alone: the outcome is not its own."""
+        told = {**self._ended_in_flight, **lost}
+        self.problems += told.values()
+        outcomes = {v.agent: v.status.outcome for v in self._views if v.status is not None and v.agent not in told}
         self.was_stopped = OPERATOR_STOP in outcomes.values()
         for agent, outcome in outcomes.items():
             if outcome not in ("completed", OPERATOR_STOP):
@@ -189,3 +195,8 @@ class SwarmWatch:
         if paused_s > _PAUSE_S:
             for view in self._views:
                 view.received_s += paused_s if view.status is not None else 0.0
+
+
+def _flies(status: StatusMessage) -> bool:
+    """Tell whether an agent is between the beginning and the end of a flight."""
+    return status.armed or Phase.STANDBY < status.phase < Phase.DONE

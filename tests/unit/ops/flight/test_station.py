@@ -15,6 +15,7 @@ from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.messages.json_messages import encode_message, first_list
 from swarmctl.bus.topics import OBSTACLES, STATUS, TICK
+from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
 from swarmctl.ops.flight.station import SwarmWatch
@@ -56,12 +57,28 @@ class Watched:
         bus = self._hub.connect("station", {STATUS: names, TICK: names, OBSTACLES: []})
         self.watch = SwarmWatch(bus, 3, folder, PlainLines(StringIO()), lambda *_, **__: None, lambda: self.now_s)
 
-    def run(self, seconds: float, phases: dict[int, Phase], armed: bool = True) -> bool:
-        """Return whether the station ends while agents report these phases; the others are silent."""
+    def run(
+        self,
+        seconds: float,
+        phases: dict[int, Phase],
+        armed: bool = True,
+        *,
+        starts: int = 1,
+        outcome: str = "completed",
+    ) -> bool:
+        """Return whether the station ends while agents report these phases; the others are silent.
+
+        Args:
+            seconds: for how long.
+            phases: of agents, by number.
+            armed: whether those that are not done are armed.
+            starts: which process of theirs it is.
+            outcome: of those that are done.
+        """
         for _ in range(round(seconds / 0.2)):
             for agent, phase in phases.items():
-                status = status_message(agent=agent, phase=phase)
-                done = msgspec.structs.replace(status, armed=False, outcome="completed")
+                status = msgspec.structs.replace(status_message(agent=agent, phase=phase), boot_id=starts)
+                done = msgspec.structs.replace(status, armed=False, outcome=outcome)
                 status = done if phase == Phase.DONE else msgspec.structs.replace(status, armed=armed, outcome="")
                 self._agents[agent].publish(STATUS, encode_message(status))
             if self.watch.step():
@@ -114,6 +131,25 @@ def test_who_armed_without_order_is_lost_too(watched: Watched) -> None:
     assert [line.split(":")[0] for line in watched.watch.problems] == [
         f"agent-{i} was lost in STANDBY" for i in range(3)
     ]
+
+
+@pytest.mark.parametrize("starts", [1, 2])
+def test_who_is_taken_over_in_flight_by_another_process_is_no_operators_landing(watched: Watched, starts: int) -> None:
+    assert not watched.run(5.0, ALL_TRACK)
+    assert not watched.run(5.0, {1: Phase.CONNECT}, starts=starts)
+    assert not watched.run(1.0, {0: Phase.DONE, 2: Phase.DONE})
+    assert not watched.run(1.0, {1: Phase.DONE}, starts=starts, outcome=OPERATOR_STOP)
+    assert watched.run(5.0, {})
+    ended = ["agent-1 ended in TRACK, and another process took its vehicle over"]
+    assert (watched.watch.problems, watched.watch.was_stopped) == (([], True) if starts == 1 else (ended, False))
+
+
+def test_who_is_started_again_on_the_ground_has_not_failed(watched: Watched) -> None:
+    assert not watched.run(2.0, dict.fromkeys(range(3), Phase.STANDBY), armed=False)
+    assert not watched.run(5.0, ALL_TRACK, starts=2)
+    assert not watched.run(2.0, dict.fromkeys(range(3), Phase.DONE), starts=2)
+    assert watched.run(5.0, {})
+    assert watched.watch.problems == []
 
 
 def test_ctrl_c_names_who_is_silent_in_flight(watched: Watched) -> None:
