@@ -65,6 +65,9 @@ class ScriptedServices(Services):
         self.hub = LocalHub(lambda: time.monotonic_ns() // 1000)
         self.bus = self.hub.connect(OPERATOR)
         self.agents = [self.hub.connect(agent_name(i)) for i in range(len(agents))]
+        self.elsewhere = self.hub.connect(agent_name(len(agents)))  # an agent of another computer
+        self.elsewhere_behind_us: int | None = None  # by how much its clock is behind ours; None: there is none
+        self.end_stamps_us: list[int] = []  # by how much each message of an end was stamped before we heard it
         self.directory = directory
         self.lands = ends(130, 0.5)  # what recovers a vehicle
         self.router = FLIES_LONG  # what is started in place of a router that has ended
@@ -115,12 +118,16 @@ class ScriptedServices(Services):
             self.orders += [order.verb for order in orders]
             self.stamped_us += [(order.utc_us, now_us - order.utc_us) for order in orders]
             ended = [order for _, payload in bus.receive(ENDED) if (order := decode_command(payload))]
+            self.end_stamps_us += [now_us - order.utc_us for order in ended if i == 0]
             self.vouched |= {int(order.arguments[PEER]) for order in ended if order.verb == EXCLUDE}
             obeys = self.obeys and i not in self.silent and i not in self.recovered  # what recovers a vehicle lands it
             if any(order.verb == "land" for order in orders) and obeys:
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:
                 bus.publish(STATUS, status_of(i, self.phases.get(i, self.phase), now_us - self.behind_us, self.held))
+        if self.elsewhere_behind_us is not None:
+            elsewhere_us = time.time_ns() // 1000 - self.elsewhere_behind_us
+            self.elsewhere.publish(STATUS, status_of(len(self.agents), self.phase, elsewhere_us, held=False))
         if time.monotonic() - self.began_s > 0.3:
             act, self.act = self.act, lambda: None
             act()

@@ -103,6 +103,15 @@ def test_a_killed_agent_is_named_and_the_others_finish(tmp_path: Path) -> None:
     assert 0 in scene.vouched, "the others need not wait for it"
 
 
+@pytest.mark.parametrize("behind_s", [0, 5])
+def test_agents_elsewhere_are_told_of_an_end_by_their_own_clock(tmp_path: Path, behind_s: int) -> None:
+    scene = ScriptedServices(tmp_path, [ends(0, 2.0), FLIES_LONG])
+    scene.elsewhere_behind_us = behind_s * 1_000_000
+    scene.act = lambda: scene.kill("agent-1")
+    scene.fly()
+    assert {round(stamp_us * 1e-6) for stamp_us in scene.end_stamps_us} == {0, behind_s}
+
+
 def test_a_vehicle_that_can_not_be_recovered_is_named(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [FLIES_LONG, ends(0, 2.0)])
     scene.lands = ends(3, 0.3)

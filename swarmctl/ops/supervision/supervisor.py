@@ -81,6 +81,7 @@ class FlightSupervisor:
         self._result = LaunchResult()
         self._viewer_watch = ViewerWatch(services.children.get(VIEWER), self._announce, services.announce)
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
+        self._elsewhere: dict[int, AgentView] = {}  # agents of other computers, as they were heard last
         self._obstacles = ObstacleKeeper(self._bus, config.obstacles)
         self._report = BusReport(self._bus, services.log.write, display)
         self._hearing = Hearing(self._bus, self._announce)
@@ -149,6 +150,8 @@ class FlightSupervisor:
         for status in self._report.statuses():
             view = next((view for view in self._views if view.agent == status.agent), None)
             if view is None:  # of another computer
+                heard = AgentView(agent=status.agent, status=status, received_s=time.monotonic())
+                self._elsewhere[status.agent] = heard
                 continue
             if view.status is None or view.status.phase != status.phase:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
@@ -194,8 +197,8 @@ class FlightSupervisor:
                 self._recover(view, code)
 
     def _vouch_for_end(self, agent: int) -> None:
-        """Tell the others that the process of an agent has ended, before another one is started in its place."""
-        others = [view for view in self._running() if view.agent != agent]
+        """Tell the others, here and elsewhere, that an agent's process has ended, before another takes its place."""
+        others = [view for view in (*self._running(), *self._elsewhere.values()) if view.agent != agent]
         self._order(Order(EXCLUDE, {PEER: agent}), others, topic=ENDED)
 
     def _order(self, order: Order, views: list[AgentView], agent: int = EVERYBODY, *, topic: Topic = COMMAND) -> None:
