@@ -34,7 +34,7 @@ class VehicleModelParams(Params):
     tilt_max_rad: float = Field(0.6, gt=0, lt=1.5)  # largest tilt that is asked for, by every controller and protection
     speed_max_m_s: float = Field(
         20.0, gt=0, le=100
-    )  # references are approached no faster, and a mission whose reference is faster is refused
+    )  # references far away are approached no faster, and a mission whose reference is faster is refused
 
     def lag(self) -> Lag | None:
         """Return the lag of the attitude behind its setpoints; None if it follows at once."""
