@@ -81,8 +81,8 @@ class ReferenceSelector:
     def reference(self, pos_ned_m: Array) -> tuple[Reference, Reference]:
         """Return the reference at the times asked for, (N, 3) each, and the mission's own one now, (1, 3).
 
-        The first, where it is far away, is approached from the own position (3,) no faster than the vehicle may fly. The
-        mission's own one is that which agents share, without the own place around it.
+        The first, where it is far away, is approached from the own position (3,) no faster than the vehicle may fly.
+        The mission's own one is that which agents share, without the own place around it.
         """
         pos, vel = self._mission_ned
         now_ref = Reference(pos[:1] - self._mission.place_offset_ned_m, vel[:1], self._yaw_rad)
