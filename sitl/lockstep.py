@@ -138,7 +138,7 @@ class Lockstep:
         self._operator = self.hub.connect(topics.OPERATOR, {})
         self._own = dict(own or {})
         self._starts = [0] * agents  # of further processes
-        self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
+        self.agents: list[Agent | None] = [self._agent(i) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
         self.starved: dict[int, int] = {}  # agent -> its processor executes one tick out of this many
         self._missed = [0] * agents
@@ -151,7 +151,7 @@ class Lockstep:
         stamp = {"utc_us": self.clock.utc_us(), "t_us": self.clock.now_us(), "source": "sitl", "event": name}
         self.fault_events.append({**stamp, "since_boot_us": t_us, **fields})
 
-    def _agent(self, index: int, transport: Any) -> Agent:
+    def _agent(self, index: int) -> Agent:
         log = self.logs[index]
         others = [i for i in range(self.config.swarm.agents) if i != index]
         bus = RelayingBus(self.hub.connect(agent_name(index), dict.fromkeys(topics.FOR_AGENTS)), others)
@@ -162,7 +162,7 @@ class Lockstep:
             config,
             index,
             boot_id,
-            transport,
+            self.links[index][0],
             bus=bus,
             clock=log.clock,
             sink=log,
@@ -207,7 +207,7 @@ class Lockstep:
     def start_again(self, index: int) -> None:
         """Start another process for an agent that was killed: it finds its vehicle where it is."""
         self._starts[index] += 1
-        self.agents[index] = self._agent(index, self.links[index][0])
+        self.agents[index] = self._agent(index)
 
     def command(self, verb: str, agent: int = -1, **arguments: float) -> None:
         """Send an operator's order, as a verb does."""

@@ -28,6 +28,7 @@ from swarmctl.configuration.constraints import (
     path_sharing_problems,
     separation_problems,
     simulated_host_problems,
+    speed_problems,
     starts_apart,
     vehicle_problems,
     volume_problems,
@@ -302,7 +303,7 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
         yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
     yield from parameter_problems(config.agent.autopilot_params)
     yield from config.agent.failsafe.problems()
-    yield from _speed_problems(config)
+    yield from speed_problems(config.vehicle_models, config.agent.state_machine, config.agent.deadlock)
     if config.sitl.speed != 1.0:
         yield (
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
@@ -314,18 +315,6 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
     yield from path_sharing_problems(config.agent.path_sharing, separation)
     drift_m = config.drift_m if agents > 1 else 0.0
     yield from separation_problems(separation, config.vehicle_model, config.limits, agents, drift_m)
-
-
-def _speed_problems(config: Config) -> Iterator[str]:
-    """Yield which speeds on ways of the agent's own are more than a vehicle may fly."""
-    most_m_s = min(model.speed_max_m_s for model in config.vehicle_models)
-    speeds_m_s = {
-        "agent.state_machine.speed_m_s": config.agent.state_machine.speed_m_s,
-        "agent.deadlock.speed_m_s": config.agent.deadlock.speed_m_s,
-    }
-    for key, speed_m_s in speeds_m_s.items():
-        if speed_m_s > most_m_s:
-            yield f"{key} = {speed_m_s:g}: more than vehicle_model.speed_max_m_s = {most_m_s:g}; lower it to that"
 
 
 def _start_problems(config: Config) -> Iterator[str]:

@@ -13,6 +13,8 @@ from swarmctl.control.collision.barrier import BarrierParams
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.phases.state_machine_params import StateMachineParams
+from swarmctl.control.reference.deadlock_params import DeadlockParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import FARTHEST_M
@@ -66,6 +68,20 @@ def separation_problems(
             f"limits.min_separation_m = {limits.min_separation_m}: larger than separation.radius_m = "
             f"{separation.radius_m}; agents would be judged by more than they keep. Lower it or raise the radius"
         )
+
+
+def speed_problems(
+    models: Sequence[VehicleModelParams], state_machine: StateMachineParams, deadlock: DeadlockParams
+) -> Iterator[str]:
+    """Yield which speeds on ways of the agents' own are more than a vehicle may fly."""
+    most_m_s = min(model.speed_max_m_s for model in models)
+    speeds_m_s = {
+        "agent.state_machine.speed_m_s": state_machine.speed_m_s,
+        "agent.deadlock.speed_m_s": deadlock.speed_m_s,
+    }
+    for key, speed_m_s in speeds_m_s.items():
+        if speed_m_s > most_m_s:
+            yield f"{key} = {speed_m_s:g}: more than vehicle_model.speed_max_m_s = {most_m_s:g}; lower it to that"
 
 
 def volume_problems(

@@ -60,7 +60,7 @@ class VehicleModelParams(Params):
 
         For as long as the controller does not react, v' = drag (wind - v); then what the wind leaves of the authority
         brakes. That grows from tilted thrust of hovering to thrust that also keeps the height: the mean counts. x500 in
-        the simulator, along an axis, by 4 and 8 m/s: 0.49 and 1.51 m; by this 0.51 and 1.63 m.
+        the simulator, along an axis, by 4 and 8 m/s: 0.49 and 1.51 m; by this 0.51 and 1.64 m.
 
         Args:
             gust_m_s: change of the wind.

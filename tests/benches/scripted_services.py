@@ -127,7 +127,7 @@ class ScriptedServices(Services):
                 bus.publish(STATUS, status_of(i, self.phases.get(i, self.phase), now_us - self.behind_us, self.held))
         if self.elsewhere_behind_us is not None:
             elsewhere_us = time.time_ns() // 1000 - self.elsewhere_behind_us
-            self.elsewhere.publish(STATUS, status_of(len(self.agents), self.phase, elsewhere_us, held=False))
+            self.elsewhere.publish(STATUS, status_of(len(self.agents), self.phase, elsewhere_us))
         if time.monotonic() - self.began_s > 0.3:
             act, self.act = self.act, lambda: None
             act()

@@ -13,7 +13,7 @@ from tests.closed_loop.conftest import Flight, Fly
 from tests.closed_loop.test_operator import phase
 
 SPEED_M_S = 3.0
-TO_NED_M = [25.0, 0.0, -5.0]  # where the reference begins, 25 m from the start, and stays
+BEGIN_NED_M, END_NED_M = [25.0, 0.0, -5.0], [25.0, 0.5, -5.0]  # of the reference, 25 m from the start
 
 
 def fly_there(fly: Fly, speed_max_m_s: float, mode: str) -> Flight:
@@ -23,7 +23,7 @@ def fly_there(fly: Fly, speed_max_m_s: float, mode: str) -> Flight:
         "start.positions_ned_m=[[0,0,-3]]",
         "mission.kind=waypoints",
         "mission.duration_s=15",
-        f"mission.waypoints.lists=[{{points_ned_m=[{TO_NED_M},[25.0,0.5,-5.0]]}}]",
+        f"mission.waypoints.lists=[{{points_ned_m=[{BEGIN_NED_M},{END_NED_M}]}}]",
         f"vehicle_model.speed_max_m_s={speed_max_m_s}",
         f"separation.mode={mode}",
         until=lambda running: phase(running) > Phase.TRACK,
@@ -39,7 +39,7 @@ def fastest_m_s(flight: Flight) -> float:
 def test_a_reference_far_away_is_approached_no_faster_than_allowed(fly: Fly, mode: str) -> None:
     flight = fly_there(fly, SPEED_M_S, mode)
     assert fastest_m_s(flight) < 1.1 * SPEED_M_S
-    assert np.abs(flight.pos_ned_m[-1, 0] - [25.0, 0.5, -5.0]).max() < 0.1
+    assert np.abs(flight.pos_ned_m[-1, 0] - END_NED_M).max() < 0.1
 
 
 def test_negative_control_without_that_limit_it_is_flown_to_as_fast_as_tilt_allows(fly: Fly) -> None:

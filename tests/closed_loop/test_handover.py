@@ -102,7 +102,7 @@ class Watched:
 
     def restart_agent(self) -> None:
         """Start a new agent process beside the same vehicle."""
-        self.run.agents[0] = self.run._agent(0, self.run.links[0][0])
+        self.run.agents[0] = self.run._agent(0)
 
     def _listen(self) -> None:
         link = self.run.links[0][0]

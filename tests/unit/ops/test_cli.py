@@ -384,13 +384,10 @@ def test_an_obstacle_that_agents_would_fly_into_is_not_added() -> None:
         assert all(said.startswith(begin) for said, begin in zip(caught.value.problems, problems, strict=True))
 
 
-def test_the_registry_knows_live_launches_and_forgets_dead_ones(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+@pytest.mark.usefixtures("nobody")
+def test_the_registry_knows_live_launches_and_forgets_dead_ones(tmp_path: Path) -> None:
     registry, folder = tmp_path / f"swarmctl-{os.getuid()}", tmp_path / "run"
     folder.mkdir()
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     started_s, pid = running_launches.process_start_s()
     launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
     running_launches.announce(launch)
@@ -405,11 +402,10 @@ def test_the_registry_knows_live_launches_and_forgets_dead_ones(
     assert list(registry.iterdir()) == []
 
 
+@pytest.mark.usefixtures("nobody")
 def test_a_launch_is_found_after_the_computers_clock_has_stepped(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     started_s, pid = running_launches.process_start_s()
     launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(tmp_path))
     running_launches.announce(launch)
@@ -420,11 +416,8 @@ def test_a_launch_is_found_after_the_computers_clock_has_stepped(
     assert running_launches.find_launch(None) == launch
 
 
-def test_a_note_that_cannot_be_written_stops_neither_the_flight_nor_the_others(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+@pytest.mark.usefixtures("nobody")
+def test_a_note_that_cannot_be_written_stops_neither_the_flight_nor_the_others(tmp_path: Path) -> None:
     started_s, pid = running_launches.process_start_s()
     launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(tmp_path / "gone"))
     running_launches.announce(launch)
@@ -509,11 +502,10 @@ def test_a_runtime_directory_of_another_user_is_not_used(monkeypatch: pytest.Mon
     assert running_launches.find_launch(None) == launch
 
 
+@pytest.mark.usefixtures("nobody")
 def test_with_several_launches_one_is_chosen_by_name_or_folder(
     run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     started_s, pid = running_launches.process_start_s()
     circle = RunningLaunch("circle-1a", "unixsock-stream//x", pid, started_s, 3, str(tmp_path / "first"))
     swap = RunningLaunch("swap-2b", "unixsock-stream//y", os.getppid(), started_s, 6, str(tmp_path / "second"))

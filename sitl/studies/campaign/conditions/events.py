@@ -106,12 +106,16 @@ class OneWayCut(_Episode):
         lockstep.hub.mend(*self._ends)
 
 
-class Freeze(_Episode):
-    """An agent's process stops for a while: its token stays, but it neither receives nor sends anything."""
+class _AgentEpisode(_Episode):
+    """An episode of one agent."""
 
     def __init__(self, agent: int, at_s: float, for_s: float) -> None:
         super().__init__(at_s, for_s)
         self._agent = agent
+
+
+class Freeze(_AgentEpisode):
+    """An agent's process stops for a while: its token stays, but it neither receives nor sends anything."""
 
     def _begin(self, lockstep: Lockstep) -> None:
         lockstep.frozen.add(self._agent)
@@ -120,12 +124,8 @@ class Freeze(_Episode):
         lockstep.frozen.discard(self._agent)
 
 
-class Restart(_Episode):
+class Restart(_AgentEpisode):
     """An agent's process dies, and another one is started for its vehicle after a while."""
-
-    def __init__(self, agent: int, at_s: float, for_s: float) -> None:
-        super().__init__(at_s, for_s)
-        self._agent = agent
 
     def _begin(self, lockstep: Lockstep) -> None:
         lockstep.kill(self._agent)
@@ -134,12 +134,11 @@ class Restart(_Episode):
         lockstep.start_again(self._agent)
 
 
-class Recovery(_Episode):
+class Recovery(_AgentEpisode):
     """The supervisor of an agent's host ends its process, and another one lands its vehicle."""
 
     def __init__(self, agent: int, at_s: float) -> None:
-        super().__init__(at_s, math.inf)
-        self._agent = agent
+        super().__init__(agent, at_s, math.inf)
 
     def _begin(self, lockstep: Lockstep) -> None:
         lockstep.recover(self._agent)
