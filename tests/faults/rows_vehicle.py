@@ -7,6 +7,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mavlink
 
+from swarmctl.agent.sharing.path_publisher import PathPublisher
 from swarmctl.control.estimation import accuracy
 from swarmctl.control.failsafe import decision
 from swarmctl.control.phases import handover
@@ -20,7 +21,7 @@ from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 from tests.closed_loop.conftest import COARSE
 from tests.faults.row import Off
 from tests.faults.rows_agents import lands
-from tests.faults.simulated import AIR, ALONE, GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow
+from tests.faults.simulated import AIR, ALONE, GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow, tracking
 
 STALE_FLOWN = Off(settings=("agent.failsafe.state_max_age_s=5",))
 ALWAYS_OURS = Off(  # neither the failsafe's table nor the state machine looks at who flies
@@ -151,6 +152,20 @@ ROWS = (
         lasts_s=6.0,
         finally_={"the agent sends": nothing_is_sent},
         off=ALWAYS_OURS,
+    ),
+    SimulatedRow(
+        name="link-lost-3s-arducopter",
+        event="the link of an ArduCopter, which lands 2 s later and flies straight on until then, is dead for 3 s",
+        reaction="its agent tells where it flies without it, the others keep clear",
+        within_s=2.5,
+        protection="path of a vehicle that hears nothing",
+        config="ardupilot_sitl.toml",
+        due=tracking(2.0),
+        happens=link("link_loss", 1.0, for_s=3.0),
+        reacts=lands,
+        lasts_s=6.0,
+        finally_={"the agent sends": nothing_is_sent},
+        off=Off(patches=((PathPublisher, "_coasts", lambda *_: False),)),
     ),
     SimulatedRow(
         name="link-bad",

@@ -21,7 +21,7 @@ from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.simulator_config import FaultParams
 from swarmctl.telemetry.recording import run_folder
-from tests.closed_loop.conftest import COARSE, mission_t_s
+from tests.closed_loop.conftest import COARSE, ROOT, mission_t_s
 from tests.faults.row import Off, Played, Row, require
 
 AIR = "sitl.start=air"
@@ -150,7 +150,8 @@ class SimulatedRow(Row):
     folder can be read, and its summary tells the violations `told`, perhaps those that `may_be_told`, and no others.
 
     Attributes:
-        scene: settings of the flight; `clocks` are of agents with a clock of their own.
+        config: file of `configs/` that is flown; None: the defaults.
+        scene: settings of the flight beside it; `clocks` are of agents with a clock of their own.
         due: when the event happens.
         happens: the event.
         reacts: whether the reaction is there.
@@ -160,6 +161,7 @@ class SimulatedRow(Row):
         regains: setpoints are followed again after they were not.
     """
 
+    config: str | None = None
     scene: tuple[str, ...] = SWAP
     clocks: tuple[int, ...] = ()
     due: Holds = _AMID_THE_WAY
@@ -177,7 +179,8 @@ class SimulatedRow(Row):
 
     def play(self, folder: Path, *, protected: bool = True) -> Played:
         with nullcontext() if protected else self.off.applied():
-            config = load(None, (*self.scene, *(() if protected else self.off.settings)))
+            path = None if self.config is None else ROOT / "configs" / self.config
+            config = load(path, (*self.scene, *(() if protected else self.off.settings)))
             folder.mkdir(parents=True)
             clocks = {agent: ClockError() for agent in self.clocks}
             scene = Scene(lockstep=Lockstep(config, folder, clocks=clocks))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 from swarmctl.agent.ports import Ports
@@ -10,14 +11,22 @@ from swarmctl.agent.sharing.path_sharing import PathSharing
 from swarmctl.bus import topics
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.control.controllers.kind import Controller
-from swarmctl.control.estimation.constant_velocity import StopJudge, predict_constant_velocity
+from swarmctl.control.estimation.constant_velocity import (
+    StopJudge,
+    predict_constant_velocity,
+    predict_without_setpoints,
+)
 from swarmctl.control.estimation.gust import GustWatch
 from swarmctl.core.trajectory import grid
-from swarmctl.core.types import MAX_MARGIN_M, Array, Plan, PredictedPath, VehicleState
+from swarmctl.core.types import MAX_MARGIN_M, Array, FlightMode, Plan, PredictedPath, VehicleState
 
 
 class PathPublisher:
-    """Tells peers where the vehicle will be: along its plan, or at constant velocity while somebody else flies it.
+    """Tells peers where the vehicle will be: along its plan, or as somebody else flies it.
+
+    While its state is stale nobody hears of it but by its path. In best effort a link that was lost for 3 s amid a swap
+    of ArduCopters made bodies touch, as long as peers expected the vehicle to brake at the end of its last path: an
+    autopilot that hears nothing flies on first.
 
     Args:
         setup: identity and parameters.
@@ -59,9 +68,9 @@ class PathPublisher:
             self._gust.forget()
         else:
             self._gust.update(self._ports.clock.now_us(), disturbance_ned_m_s2)
-        if state is None or (flown is None and not self._is_recent(state)):
+        if state is None or (flown is None and not (self._is_recent(state) or self._coasts(state))):
             return
-        margin_m = min(MAX_MARGIN_M, sum((*margins_m, self._gust.margin_m)))
+        margin_m = sum((*margins_m, self._gust.margin_m))
         topic = self._topic()
         path = self._sharing.choose(self._path(state, flown, seq, margin_m), always=topic is topics.FAR_PATH)
         if path is not None:
@@ -71,6 +80,14 @@ class PathPublisher:
     def _is_recent(self, state: VehicleState) -> bool:
         """Return whether a state may be continued: peers could not tell that a path from it is older than it says."""
         return self._ports.clock.now_us() - state.t_us <= self._max_age_us
+
+    def _coasts(self, state: VehicleState) -> bool:
+        """Return whether a vehicle of which nothing is heard still flies on as its autopilot does without a link."""
+        coasts_s = self._ports.autopilot.landing_delay_s
+        if coasts_s is None or state.mode is not FlightMode.EXTERNAL:
+            return False
+        brakes_s = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)) / self._setup.separation.brake_m_s2
+        return self._ports.clock.now_us() - state.t_us <= (coasts_s + brakes_s) * 1e6
 
     def _topic(self) -> topics.Topic:
         """Return the topic of this tick's path: that of peers within reach, or at times that of all."""
@@ -85,16 +102,26 @@ class PathPublisher:
             self._stop_judge.forget()
             t0_us, dt_us, pos = flown.t0_us, flown.dt_us, flown.pos_ned_m
         else:
-            stops = self._stop_judge.update(state)
-            t0_us, dt_us = self._ports.clock.now_us() + self._delay_us, self._dt_us
-            ahead_s = grid(self._steps) * (dt_us * 1e-6) + (t0_us - state.t_us) * 1e-6
-            pos = predict_constant_velocity(state, ahead_s, self._setup.separation.brake_m_s2, stops=stops)
+            now_us = self._ports.clock.now_us()
+            t0_us, dt_us = now_us + self._delay_us, self._dt_us
+            pos = self._without_agent(state, grid(self._steps) * (dt_us * 1e-6) + (t0_us - state.t_us) * 1e-6)
+            if not self._is_recent(state):  # as much as peers keep from a path of this age
+                age_s = (now_us - state.t_us) * 1e-6
+                margin_m += self._setup.separation.budget.age_margin_m(age_s, parked=False)
         return PredictedPath(
             agent=self._setup.agent,
             boot_id=self._setup.boot_id,
             seq=seq,
             t0_utc_us=self._ports.utc_of_us(t0_us),
             dt_us=dt_us,
-            margin_m=margin_m,
+            margin_m=min(MAX_MARGIN_M, margin_m),
             pos_ned_m=pos,
         )
+
+    def _without_agent(self, state: VehicleState, ahead_s: Array) -> Array:
+        """Return positions (N, 3), NED [m], at `ahead_s` (N,) after a state of a vehicle that its autopilot flies."""
+        brake_m_s2, autopilot = self._setup.separation.brake_m_s2, self._ports.autopilot
+        keeps_s, coasts_s = autopilot.setpoint_loss_s, autopilot.landing_delay_s
+        if self._is_recent(state) or keeps_s is None or coasts_s is None:
+            return predict_constant_velocity(state, ahead_s, brake_m_s2, stops=self._stop_judge.update(state))
+        return predict_without_setpoints(state, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)

@@ -7,11 +7,14 @@ from collections import deque
 
 import numpy as np
 
+from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
+from swarmctl.core.trajectory import braking_displacement
 from swarmctl.core.types import Array, FlightMode, VehicleState
 
 CREEP_M_S = 0.5  # a slower vehicle in hold is taken to rest: estimates of hovering ones wander as fast
 _ENTERS_US = 1_000_000  # time in hold for which it is taken to brake, whatever its speed does
 _WINDOW_US = 400_000  # over which speeds are compared after that
+_LEAST_COS = 0.5  # of a tilt that is kept
 _BRAKES_M_S = 0.2  # by which the speed of one that brakes falls in that time; PX4 brakes at 3 m/s2
 
 
@@ -25,6 +28,24 @@ def predict_constant_velocity(state: VehicleState, ahead_s: Array, brake_m_s2: f
         t_s = np.minimum(ahead_s, speed / brake_m_s2)
         ahead_s = t_s - 0.5 * brake_m_s2 * t_s * t_s / max(speed, 1e-6)  # time to travel as far at the present speed
     return np.asarray(state.pos_ned_m + ahead_s[:, None] * state.vel_ned_m_s)
+
+
+def predict_without_setpoints(
+    state: VehicleState, ahead_s: Array, *, keeps_s: float, coasts_s: float, brake_m_s2: float
+) -> Array:
+    """Return positions (N, 3), NED [m], at `ahead_s` (N,) after the last state before a vehicle hears nothing more.
+
+    Its autopilot keeps the attitude for `keeps_s`, which accelerates it in the plane, levels and coasts on until
+    `coasts_s`, and then brakes and lands.
+    """
+    keeps_s, tilt_ned = min(keeps_s, coasts_s), body_z_ned(state.q_nb)
+    accel_ned_m_s2 = np.append(-GRAVITY_M_S2 / max(_LEAST_COS, tilt_ned[2]) * tilt_ned[:2], 0.0)
+    kept_s, later_s = np.minimum(ahead_s, keeps_s)[:, None], np.maximum(ahead_s - keeps_s, 0.0)
+    vel_ned_m_s = state.vel_ned_m_s + keeps_s * accel_ned_m_s2
+    coasted_s = np.minimum(later_s, coasts_s - keeps_s)[:, None]
+    braked_ned_m = braking_displacement(vel_ned_m_s, ahead_s - coasts_s, brake_m_s2)
+    kept_ned_m = kept_s * state.vel_ned_m_s + 0.5 * kept_s**2 * accel_ned_m_s2
+    return np.asarray(state.pos_ned_m + kept_ned_m + coasted_s * vel_ned_m_s + braked_ned_m)
 
 
 class StopJudge:

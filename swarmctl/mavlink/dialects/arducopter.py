@@ -173,5 +173,6 @@ ARDUCOPTER = Dialect(
     fence_checks=(),
     log_suffix=".bin",
     loss_parameter="GUID_TIMEOUT",
+    landing_parameter="FS_GCS_TIMEOUT",
     heeds_parameter="SYSID_MYGCS",
 )

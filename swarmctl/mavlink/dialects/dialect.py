@@ -74,7 +74,8 @@ class Dialect:
     also_read: tuple[str, ...]  # parameters that these checks refer to
     fence_checks: tuple[ParameterCheck, ...]  # what it thinks besides with a geofence; empty: none is uploaded to it
     log_suffix: str  # of the logs that it writes itself
-    loss_parameter: str  # parameter of the setpoint timeout [s]
+    loss_parameter: str  # parameter of the setpoint timeout [s]: until then the last attitude is flown
+    landing_parameter: str  # parameter of the time [s] after which it brakes and lands when nothing comes any more
     restore_after_s: float = 0.0  # from a disarm that is heard; until then it may be saving its parameters
     heeds_parameter: str = ""  # system id whose heartbeats its link-loss failsafe counts; "": any
 

@@ -175,5 +175,6 @@ PX4 = Dialect(
     fence_checks=(ParameterCheck("GF_ACTION", "what happens at the geofence", _fence_action),),
     log_suffix=".ulg",
     loss_parameter="COM_OF_LOSS_T",
+    landing_parameter="COM_OF_LOSS_T",
     restore_after_s=1.0,  # it saves 0.3 s after a disarm; one that is set while it verifies the file can stop it
 )

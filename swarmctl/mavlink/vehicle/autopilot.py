@@ -178,6 +178,11 @@ class Autopilot:
         """Return the time without setpoints after which the autopilot takes over; None until it has told."""
         return None if self.dialect is None else self.params.get(self.dialect.loss_parameter)
 
+    @property
+    def landing_delay_s(self) -> float | None:
+        """Return the time after which the autopilot brakes and lands when it hears nothing; None until it has told."""
+        return None if self.dialect is None else self.params.get(self.dialect.landing_parameter)
+
     def close(self) -> None:
         self._transport.close()
 

@@ -608,6 +608,7 @@ MINIMAL: dict[str, Any] = {
     "fence_checks": (),
     "log_suffix": ".log",
     "loss_parameter": "LOSS",
+    "landing_parameter": "LANDING",
 }
 
 

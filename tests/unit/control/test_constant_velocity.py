@@ -8,7 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarmctl.control.estimation.constant_velocity import StopJudge, predict_constant_velocity
+from swarmctl.control.estimation.constant_velocity import (
+    StopJudge,
+    predict_constant_velocity,
+    predict_without_setpoints,
+)
+from swarmctl.core.frames import GRAVITY_M_S2, quat_from_euler
 from swarmctl.core.types import FlightMode
 from tests import builders
 
@@ -32,6 +37,24 @@ def test_braking_is_predicted_of_who_stops() -> None:
     assert predict_constant_velocity(resting, AHEAD_S, BRAKE_M_S2, stops=True) == pytest.approx(
         np.tile(STATE.pos_ned_m, (len(AHEAD_S), 1))
     )
+
+
+def test_who_hears_nothing_keeps_its_tilt_then_coasts_and_then_brakes() -> None:
+    """By g/10 for 1 s, straight on until 2 s, and at 2 m/s2 to rest: ArduCopter by configs/ardupilot_sitl.toml."""
+    accel_m_s2 = 0.1 * GRAVITY_M_S2
+    tilted = replace(STATE, q_nb=quat_from_euler(0.0, -np.arctan(0.1), 0.0), mode=FlightMode.EXTERNAL)
+    ahead_s = np.array([0.0, 1.0, 2.0, 2.5, 9.0])
+    pos = predict_without_setpoints(tilted, ahead_s, keeps_s=1.0, coasts_s=2.0, brake_m_s2=BRAKE_M_S2)
+    speed_m_s = 2.0 + accel_m_s2
+    way_m = np.array([0.0, 2.0 + 0.5 * accel_m_s2, 4.0 + 1.5 * accel_m_s2, 0.0, 0.0])
+    way_m[3:] = way_m[2] + np.array([0.5 * speed_m_s - 0.25, 0.25 * speed_m_s**2])
+    assert pos == pytest.approx(STATE.pos_ned_m + np.outer(way_m, [1.0, 0.0, 0.0]))
+
+
+def test_who_lands_before_it_levels_brakes_from_the_tilt_it_has() -> None:
+    level = replace(STATE, mode=FlightMode.EXTERNAL)
+    pos = predict_without_setpoints(level, AHEAD_S, keeps_s=1.0, coasts_s=0.5, brake_m_s2=BRAKE_M_S2)
+    assert pos[[5, 30]] == pytest.approx(STATE.pos_ned_m + np.outer([1.0, 2.0], [1.0, 0.0, 0.0]))
 
 
 def judged(mode: FlightMode, speeds_m_s: Sequence[float]) -> list[bool]:
