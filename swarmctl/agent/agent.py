@@ -284,6 +284,7 @@ class Agent:
             state,
             flies=self._modes.mode in FLOWN_BY_AGENT,
             committed_peers=self._planner.directive.committed_peers,
+            reference=planning.reference,
         )
         if setpoint is not None:
             self._vehicle_watch.report_gap(now_us, self._deadlines.stop_cause(now_us))

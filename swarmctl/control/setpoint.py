@@ -11,6 +11,9 @@ from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
 from swarmctl.core.types import Array, AttitudeSetpoint
 
 VALID_US = 100_000  # a setpoint is stale after this time
+_SUNK_M = 0.3  # below the reference; more than a gust costs that thrust makes good again
+_CLIMB_1_S2 = 2.0  # vertical acceleration left for each metre more
+_CLIMB_MAX_M_S2 = 1.0
 
 
 def within_tilt(virtual_control: Array, params: VehicleModelParams) -> Array:
@@ -18,11 +21,35 @@ def within_tilt(virtual_control: Array, params: VehicleModelParams) -> Array:
 
     Controllers bound each axis by itself, so both together may ask for 1.4 times as much.
     """
-    ux, uy, specific = virtual_control.tolist()
-    tilt, limit = math.hypot(ux, uy), params.u_max()
-    if not tilt > limit:
+    return _shortened(virtual_control, params.u_max())
+
+
+def holding_height(virtual_control: Array, below_m: float, thrust_max_m_s2: float) -> Array:
+    """Return virtual controls (3,) whose tilt is shortened until the largest thrust carries a sunken vehicle up again.
+
+    Against a wind that asks for more than thrust has, a controller that plans height and position apart tilts as far as
+    it may, and pays for it with height: in 10 m/s an x500 lost 8 m in 14 s, on the ground it would have been after 5 s.
+    Height goes first: what is near is below, and the wind takes a level vehicle no farther than it must.
+
+    Args:
+        virtual_control: u_x, u_y, and thrust over mass [m/s2].
+        below_m: height of the reference above the vehicle.
+        thrust_max_m_s2: largest thrust over mass.
+    """
+    if below_m <= _SUNK_M:
         return virtual_control
-    return np.array([ux * limit / tilt, uy * limit / tilt, specific])
+    carried_m_s2 = GRAVITY_M_S2 + min(_CLIMB_MAX_M_S2, _CLIMB_1_S2 * (below_m - _SUNK_M))
+    most = math.sqrt(max(0.0, 1.0 - (carried_m_s2 / thrust_max_m_s2) ** 2))
+    return _shortened(virtual_control, most)
+
+
+def _shortened(virtual_control: Array, most: float) -> Array:
+    """Return virtual controls (3,) whose (u_x, u_y) is no longer than `most`."""
+    ux, uy, specific = virtual_control.tolist()
+    tilt = math.hypot(ux, uy)
+    if not tilt > most:
+        return virtual_control
+    return np.array([ux * most / tilt, uy * most / tilt, specific])
 
 
 def setpoint_of(

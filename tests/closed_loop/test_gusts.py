@@ -13,6 +13,8 @@ from sitl.studies.campaign.collision_monitor import CollisionMonitor
 from sitl.studies.campaign.conditions.events import SimulatorFault
 from sitl.studies.campaign.flight import TrialFlight, drawn
 from sitl.studies.campaign.trials import Trial
+from swarmctl.agent.flying import setpoint_output
+from swarmctl.agent.watches.alerts import Alert
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.config import Config, load
 from swarmctl.control.commit.protocol import Commitments
@@ -22,7 +24,7 @@ from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Mode, Phase
 from swarmctl.simulator_config import FaultParams
 from tests.benches.guaranteed_trials import GUARANTEED_SWAP
-from tests.closed_loop.conftest import COARSE, ROOT
+from tests.closed_loop.conftest import COARSE, ROOT, fly_now
 
 X500 = ROOT / "configs" / "x500_circle.toml"
 HOVER = ("sitl.start=air", "mission.kind=hover", "mission.duration_s=8", "sitl.estimator=exact")
@@ -88,12 +90,39 @@ def test_a_vehicle_that_brakes_at_all_tilt_it_has_stays_under_control() -> None:
     place = "start.positions_ned_m=[[0,0,-5]]"
     wind = SimulatorFault(FaultParams(kind="wind", vehicle=0, value=12.0, towards_deg=40.0, for_s=5.0), 2.0)
     flight = track_in_wind(
-        load(X500, [*HOVER, *COARSE, "swarm.agents=1", "mission.duration_s=14", place, box]), wind, 8.0
+        load(X500, [*HOVER, *COARSE, "swarm.agents=1", "mission.duration_s=14", place, box]), wind, 10.0
     )
     rows = flight.logs[0].ticks
     assert [event for event in flight.logs[0].events if event["event"] == "setpoint_refused"] == []
     assert Mode.PILOT_OVERRIDE not in rows["mode"] and Mode.BRAKE in rows["mode"]
     assert np.linalg.norm(flight.truth["pos_ned_m"][-1, :2]) < 5.0
+
+
+def sunken_in_wind(wind_m_s: float, towards_deg: float) -> tuple[float, str]:
+    """Return how far one on the circle sinks below its reference in a steady wind, and its alert after 4 s."""
+    north, east = (wind_m_s * turn(math.radians(towards_deg)) for turn in (math.cos, math.sin))
+    told: list[Alert | None] = []
+
+    def note_alert(running: Lockstep) -> None:
+        assert running.agents[0] is not None
+        told.append(running.agents[0]._publisher.active_alert)
+
+    settings = ("swarm.agents=1", "mission.duration_s=10", f"sitl.wind.mean_ned_m_s=[{north:.3f},{east:.3f},0]")
+    flight = fly_now("sitl.start=air", *settings, config=X500.name, at={4.0: note_alert})
+    _, error_ned_m = flight.tracked(0)
+    return float(error_ned_m[:, 2].max()), "" if told[0] is None else told[0].text
+
+
+@pytest.mark.parametrize("towards_deg", [0.0, 45.0])
+def test_a_wind_that_thrust_does_not_hold_costs_place_and_not_height(
+    towards_deg: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """11 m/s, upwind on the circle 13: tilted against it as far as it may be, an x500 does not carry itself."""
+    sunken_m, told = sunken_in_wind(11.0, towards_deg)
+    assert sunken_m < 2.5
+    assert "too low: tilts no more than its thrust holds" in told
+    monkeypatch.setattr(setpoint_output, "holding_height", lambda virtual_control, *_: virtual_control)
+    assert sunken_in_wind(11.0, towards_deg)[0] > 5.0
 
 
 def blown_farther_than_expected(*sets: str) -> CollisionMonitor:

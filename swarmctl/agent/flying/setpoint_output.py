@@ -12,10 +12,10 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.mpc.problem import Start
 from swarmctl.control.reference.heading import Heading
-from swarmctl.control.setpoint import setpoint_of, within_tilt
+from swarmctl.control.setpoint import holding_height, setpoint_of, within_tilt
 from swarmctl.core.frames import euler_from_quat
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.types import AttitudeSetpoint, Plan, VehicleState
+from swarmctl.core.types import Array, AttitudeSetpoint, Plan, Reference, VehicleState
 
 
 class SetpointOutput:
@@ -41,6 +41,7 @@ class SetpointOutput:
         alerts: Alerts,
     ) -> None:
         self._model, self._heading = setup.vehicle_model, Heading(setup.mission.yaw_rad)
+        self._thrust_max_m_s2 = min(setup.controller.mpc.thrust_max_m_s2, self._model.thrust_range_m_s2()[1])
         self._ports, self._safety_filter, self._own_state = ports, safety_filter, own_state
         self._references, self._alerts = references, alerts
 
@@ -53,6 +54,7 @@ class SetpointOutput:
         *,
         flies: bool,
         committed_peers: Mapping[int, Sequence[Trajectory]],
+        reference: Reference | None,
     ) -> AttitudeSetpoint | None:
         """Send the command of a plan that acts when the setpoint arrives; returns what has been sent.
 
@@ -63,6 +65,7 @@ class SetpointOutput:
             state: newest one of the vehicle.
             flies: the agent flies the vehicle in this tick's mode.
             committed_peers: trajectories that peers have committed to.
+            reference: of the mission now; None if unknown.
         """
         if flown is None or start is None:
             self._safety_filter.skip(now_us)
@@ -78,6 +81,7 @@ class SetpointOutput:
             flies=flies,
             committed_peers=committed_peers,
         )
+        virtual_control = self._holding_height(now_us, virtual_control, state, reference)
         virtual_control = within_tilt(virtual_control, self._model)  # what is remembered is what is flown
         if not flies and state is not None:
             self._heading.begin(euler_from_quat(state.q_nb)[2])
@@ -89,3 +93,16 @@ class SetpointOutput:
             return None
         self._own_state.sent(now_us, virtual_control, setpoint.thrust_01)
         return setpoint
+
+    def _holding_height(
+        self, now_us: int, virtual_control: Array, state: VehicleState | None, reference: Reference | None
+    ) -> Array:
+        """Return a command (3,) that gives up no more height, and say so where it is not the one asked for."""
+        if state is None or reference is None:
+            return virtual_control
+        below_m = float(state.pos_ned_m[2] - reference.pos_ned_m[0, 2])
+        held = holding_height(virtual_control, below_m, self._thrust_max_m_s2)
+        if held is not virtual_control:
+            text = f"{below_m:.1f} m too low: tilts no more than its thrust holds, and may be blown away"
+            self._alerts.put("height", text, now_us)
+        return held

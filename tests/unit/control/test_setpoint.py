@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmctl.control.model import Predictor, VehicleModelParams, acceleration, tilt_rate
-from swarmctl.control.setpoint import VALID_US, setpoint_of, within_tilt
+from swarmctl.control.setpoint import VALID_US, holding_height, setpoint_of, within_tilt
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned, euler_from_quat, quat_from_body_z
 from swarmctl.core.types import Array, VehicleState
 from tests import builders
@@ -196,3 +196,14 @@ def test_both_axes_together_tilt_no_more_than_the_vehicle_may() -> None:
     assert found[0] == -found[1] and found[2] == 12.0
     within = np.array([0.3, -0.3, 12.0])
     assert within_tilt(within, MODEL) is within
+
+
+def test_who_has_sunk_tilts_no_more_than_its_thrust_carries_up_again() -> None:
+    asked = np.array([0.6, -0.6, 15.0])
+    assert holding_height(asked, 0.3, 15.0) is asked, "what a gust costs is made good again"
+    held = holding_height(asked, 2.0, 15.0)
+    assert held[0] == -held[1] > 0.0, "the direction stays"
+    assert 15.0 * math.sqrt(1.0 - held[0] ** 2 - held[1] ** 2) == pytest.approx(GRAVITY_M_S2 + 1.0)
+    upright = np.array([0.1, 0.1, 15.0])
+    assert holding_height(upright, 2.0, 15.0) is upright
+    assert holding_height(asked, 2.0, 10.0)[:2] == pytest.approx([0.0, 0.0]), "level where thrust is too weak"
