@@ -66,6 +66,7 @@ def run_station(config: Config, options: LaunchOptions) -> int:
             router = services.children[ROUTER]
             while not (stop.count or watch.step()):
                 viewer.step()
+                services.announce_clock()
                 if router.poll() is not None:
                     watch.problems.append(f"router {router.how_it_ended()}; see {router.log}. The swarm flies on")
                     break

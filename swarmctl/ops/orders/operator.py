@@ -21,7 +21,6 @@ from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
 from swarmctl.bus.topics import ANSWER, OBSTACLES, OPERATOR, STATUS
 from swarmctl.errors import StartError
 from swarmctl.ops.running_launches import RunningLaunch, refuse_ending, runs
-from swarmctl.wall_clock import utc_us
 
 ANSWER_S = 5.0  # longest wait for what is asked over the bus
 REPEAT_S = 0.2
@@ -43,7 +42,7 @@ def joined(launch: RunningLaunch) -> Iterator[Bus]:
             {STATUS: senders, ANSWER: senders, OBSTACLES: list_keepers(launch.identity)},
             identity=launch.identity,
             max_age_us=FOR_OPERATORS_US,
-            utc_us=utc_us,
+            utc_us=launch.utc_us,
             connect_timeout_ms=3000,
         )
         with contextlib.closing(bus):

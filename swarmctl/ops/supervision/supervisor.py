@@ -30,7 +30,7 @@ from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, t
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
 from swarmctl.telemetry.recording.event_log import EventLog
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
-from swarmctl.wall_clock import utc_us
+from swarmctl.wall_clock import WallClock
 
 _STEP_S = 0.05
 _FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
@@ -53,9 +53,14 @@ class Services:
     log: EventLog
     children: dict[str, Child]  # by name; agents have their names on the bus
     bus: Bus | None = None
+    clock: WallClock  # as agents have it: it follows steps of UTC slowly
 
     def announce(self, view: str) -> None:
         """Publish the address of the live view to the operator's commands."""
+        raise NotImplementedError
+
+    def announce_clock(self) -> None:
+        """Publish the clock to the operator's commands again, where it was corrected."""
         raise NotImplementedError
 
     def restart_router(self) -> None:
@@ -207,7 +212,7 @@ class FlightSupervisor:
         clocks_us = [
             view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in views if view.status is not None
         ]
-        for message in order_messages(numbered(order), agent, utc_us(), clocks_us):
+        for message in order_messages(numbered(order), agent, self._services.clock.utc_us(), clocks_us):
             self._bus.publish(topic, message)
 
     def _recover(self, view: AgentView, code: int) -> None:
@@ -268,6 +273,7 @@ class FlightSupervisor:
     def _speak(self) -> None:
         now_s = time.monotonic()
         self._obstacles.repeat()
+        self._services.announce_clock()
         if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
             self._land_said_s = now_s
             self._repeat_land_order(now_s - self._land_ordered_s)
