@@ -53,13 +53,15 @@ def joined(launch: RunningLaunch) -> Iterator[Bus]:
 
 
 def list_keepers(identity: OwnIdentity | None) -> tuple[str, ...]:
-    """Return the senders whose list of obstacles an operator, or a supervisor, takes for that of the swarm.
-
-    The station, which keeps none, takes that of any host.
-    """
+    """Return the senders whose list of obstacles is heard here: an operator has to know all lists, to change them."""
     if identity is None:
         return (OPERATOR,)
-    return identity.roster.commanders(identity.name) if identity.speaker.agents else identity.roster.hosts
+    return identity.roster.names if identity.speaker.operator else list_setters(identity)
+
+
+def list_setters(identity: OwnIdentity | None) -> tuple[str, ...]:
+    """Return the senders whose list of obstacles a computer adopts by itself."""
+    return (OPERATOR,) if identity is None else identity.roster.commanders(identity.name)
 
 
 def view_address(launch: RunningLaunch) -> str:

@@ -18,12 +18,13 @@ from swarmctl.config import Config
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
+from swarmctl.ops.orders.operator import list_setters
 from swarmctl.ops.orders.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
-from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
+from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper, adoption_text
 from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.supervision.standstill import Standstill
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
@@ -87,8 +88,14 @@ class FlightSupervisor:
         self._viewer_watch = ViewerWatch(services.children.get(VIEWER), self._announce, services.announce)
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
         self._elsewhere: dict[int, AgentView] = {}  # agents of other computers, as they were heard last
-        self._obstacles = ObstacleKeeper(self._bus, config.obstacles)
         self._report = BusReport(self._bus, services.log.write, display)
+        self._obstacles = ObstacleKeeper(
+            self._bus,
+            config.obstacles,
+            services.clock,
+            trusted=list_setters(services.context.identity),
+            refuse=self._report.refuse,
+        )
         self._hearing = Hearing(self._bus, self._announce)
         self._standstill = Standstill()
         self._started_s = self._stepped_s = time.monotonic()
@@ -165,9 +172,13 @@ class FlightSupervisor:
             if status.phase == Phase.TRACK:  # also of a mission that an operator has set
                 self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + status.ends_in_s)
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
-        for message in self._obstacles.receive():
-            text = f"{len(message.obstacles)} obstacles, set by an operator"
-            self._announce("obstacles", text, **recorded_list(message))
+        for adoption in self._obstacles.receive():
+            text = f"{len(adoption.after.obstacles)} obstacles, set by an operator"
+            self._announce("obstacles", text, **recorded_list(adoption.after))
+            if overruled := adoption_text(adoption.before, adoption.after):
+                self._announce("obstacles_overruled", overruled)
+        for text in self._obstacles.others():
+            self._announce("obstacles_elsewhere", text)
         self._report.step()
 
     def _watch_essential_processes(self) -> None:
