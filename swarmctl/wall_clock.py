@@ -42,6 +42,10 @@ class WallClock:
         self._discipline()
         return (1000 * t_us + self._offset_ns) // 1000
 
+    def utc_ahead_us(self) -> int:
+        """Return by how much UTC is ahead of monotonic time."""
+        return self.utc_of_us(0)
+
     def _discipline(self) -> int:
         """Follow the host's UTC; return it [ns]."""
         now_ns = self._monotonic_ns()

@@ -20,6 +20,7 @@ import psutil
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
+from swarmctl.wall_clock import monotonic_us, utc_us
 
 LAUNCH_FILE = "launch.json"
 _START_TOLERANCE_S = 1.0
@@ -39,6 +40,11 @@ class RunningLaunch(msgspec.Struct, frozen=True):
     identity: OwnIdentity | None = None  # as which operators speak here; None: a launch on one computer
     version: str = ""  # of the swarmctl that flies
     ending: bool = False  # nobody answers any more; its report is still written
+    utc_ahead_us: int | None = None  # of its clock over monotonic time, which is the same for all processes here
+
+    def utc_us(self) -> int:
+        """Return UTC by the launch's clock, which follows steps of the computer's slowly [us]."""
+        return utc_us() if self.utc_ahead_us is None else monotonic_us() + self.utc_ahead_us
 
 
 def announce(launch: RunningLaunch) -> None:

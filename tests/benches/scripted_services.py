@@ -21,6 +21,7 @@ from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.ops.supervision.status_table import AgentView
 from swarmctl.ops.supervision.supervisor import FlightSupervisor, Services
 from swarmctl.telemetry.recording.event_log import EventLog
+from swarmctl.wall_clock import WallClock
 from tests import builders
 
 LANDS_ON_SIGTERM = """
@@ -52,6 +53,7 @@ class ScriptedServices(Services):
     """Services made of scripted processes; it is also the display, which the flight calls once in every step."""
 
     def __init__(self, directory: Path, agents: Sequence[str], others: dict[str, str] | None = None) -> None:
+        self.clock = WallClock()
         self.log = EventLog(directory / "launch.events.jsonl", "launch")
         self.context = RunContext("run", "unixsock-stream//nowhere", directory, tuple(range(len(agents))))
         scripts = {agent_name(i): script for i, script in enumerate(agents)} | (others or {ROUTER: FLIES_LONG})
@@ -89,6 +91,9 @@ class ScriptedServices(Services):
 
     def announce(self, view: str) -> None:
         self.said.append(f"announced {view}")
+
+    def announce_clock(self) -> None:
+        return
 
     def restart_router(self) -> None:
         self.children[ROUTER] = Child(Command(ROUTER, (sys.executable, "-ESc", self.router)), self.directory)

@@ -8,7 +8,13 @@ from dataclasses import replace
 
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.json_messages import ListedObstacle, StatusMessage, decode_obstacles, decode_status
+from swarmctl.bus.messages.json_messages import (
+    ListedObstacle,
+    ObstaclesMessage,
+    StatusMessage,
+    decode_obstacles,
+    decode_status,
+)
 from swarmctl.bus.messages.path_messages import stamp_us
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peer_clocks import PeerClocks
@@ -81,8 +87,7 @@ class WorldModel:
         self._status: dict[int, StatusMessage] = {}
         self._status_us: dict[int, int] = {}  # UTC of the newest one's arrival
         self._vouched: dict[int, int | None] = {}  # boot id of each agent that somebody says has ended
-        self._obstacles: tuple[ListedObstacle, ...] = ()
-        self._obstacles_version: int | None = None
+        self._listed: ObstaclesMessage | None = None  # the newest list of obstacles
         self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by number
 
     def receive(self, utc_us: int) -> list[Order]:
@@ -147,17 +152,18 @@ class WorldModel:
             self._status[status.agent], self._status_us[status.agent] = status, utc_us
 
     def _take_obstacles(self, sender: str, payload: bytes, utc_us: int) -> None:
-        message, known = decode_obstacles(payload), self._obstacles_version
+        message, known = decode_obstacles(payload), self._listed
         if message is None:
             self.refusals.add(sender, topics.OBSTACLES.name, MALFORMED, utc_us)
-        elif message.replaces(known):
-            self._obstacles_version = message.version
+        elif message.proposed:
+            return  # whoever keeps the list on this computer repeats it when it is adopted
+        elif known is None or message.replaces(known) or message.corrects(known):
             if message.obstacles != self._obstacles:
                 self._note("obstacles_changed", version=message.version, listed=payload.decode(errors="replace"))
-            unchanged = set(self._obstacles) & set(message.obstacles)
-            self._seen = {item.number: item.obstacle for item in unchanged if item.number in self._seen}
-            self._obstacles = message.obstacles
-        elif known is not None and message.version > known:
+            before, now = ({item.without_time for item in listed} for listed in (self._obstacles, message.obstacles))
+            self._seen = {number: obstacle for number, obstacle in before & now if number in self._seen}
+            self._listed = message
+        elif message.is_too_far_from(known):
             self.refusals.add(sender, topics.OBSTACLES.name, SEQUENCE, utc_us)
 
     def _watch_unresponsive(self, utc_us: int) -> None:
@@ -220,6 +226,10 @@ class WorldModel:
             return KeepOuts(found, places)
         self._seen.update(seen)
         return KeepOuts(found + [keep_out_of_obstacle(o, dt_us, steps, params, number=n) for n, o in seen.items()])
+
+    @property
+    def _obstacles(self) -> tuple[ListedObstacle, ...]:
+        return () if self._listed is None else self._listed.obstacles
 
     def _visible(self, pos_ned_m: Array, utc_us: int) -> dict[int, Obstacle]:
         """Return the obstacles that are visible from a position (3,), as they are at a time, by number."""

@@ -24,6 +24,7 @@ _OBSTACLE_KEYS = {"center_ned_m", "radius_m", "keep_out_m", "visibility_m"}  # n
 MAX_VERSION_STEP = (
     2**20
 )  # largest step of the list's version: late joiners have missed many, and forgers don't reach its end
+MAX_ANCESTORS = 64  # lists before this one by which it is known whether its operator knew another list
 MAX_REASON = 500  # longest reason of a refusal, or text about what is obeyed
 Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
@@ -112,22 +113,78 @@ class ListedObstacle(msgspec.Struct, frozen=True, kw_only=True):
     since_utc_us: Count  # when its centre was at `center_ned_m`, by the launch's clock
     obstacle: Obstacle
 
+    @property
+    def without_time(self) -> tuple[int, Obstacle]:
+        """Return what an operator has set, without the time, which a keeper corrects with its clock."""
+        return (self.number, self.obstacle)
+
     def at(self, utc_us: int) -> Obstacle:
         """Return the obstacle as it is at a time: moved on, if it moves."""
         return self.obstacle.moved((utc_us - self.since_utc_us) * 1e-6)
 
 
 class ObstaclesMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """Holds the whole list of obstacles; a higher `version` replaces a lower one."""
+    """Holds the whole list of obstacles. All lists have one order, so that all hosts come to keep the same one.
+
+    Operators who do not hear each other give two lists the same version. Then the draw decides, everywhere alike.
+    """
 
     version: Count
     utc_us: Count  # time of sending, by the launch's clock
     next_number: Count  # of the next obstacle that is added
     obstacles: Annotated[tuple[ListedObstacle, ...], msgspec.Meta(max_length=MAX_OBSTACLES)]
+    draw: Count = 0  # random, by who has set the list; 0: it is as configured
+    made_from: Annotated[tuple[Count, ...], msgspec.Meta(max_length=MAX_ANCESTORS)] = ()  # draws of lists before it
+    proposed: bool = False  # by an operator to those who keep the list; what they repeat is not
 
-    def replaces(self, version: int | None) -> bool:
-        """Tell whether the list is newer than the known version (None: no list), by at most `MAX_VERSION_STEP`."""
-        return version is None or 0 < self.version - version <= MAX_VERSION_STEP
+    @property
+    def rank(self) -> tuple[int, int]:
+        """Return the place of the list in the order of all lists."""
+        return (self.version, self.draw)
+
+    def replaces(self, known: ObstaclesMessage | None) -> bool:
+        """Tell whether the list comes after the known one (None: no list), by at most `MAX_VERSION_STEP`.
+
+        A proposal of the same version does not: its operator hears of the known one, and makes it again from there.
+        """
+        if known is None:
+            return True
+        is_later = self.version > known.version if self.proposed else self.rank > known.rank
+        return is_later and not self.is_too_far_from(known)
+
+    def is_too_far_from(self, known: ObstaclesMessage) -> bool:
+        """Tell whether nobody who knows that list can have come to this one."""
+        return self.version - known.version > MAX_VERSION_STEP
+
+    def corrects(self, known: ObstaclesMessage) -> bool:
+        """Tell whether it is the same list by a clock that was corrected, so that what moves is elsewhere."""
+        if self.rank != known.rank or not any(item.obstacle.moves for item in self.obstacles):
+            return False
+        own, others = ([item.without_time for item in listed.obstacles] for listed in (self, known))
+        return own == others
+
+    def includes(self, known: ObstaclesMessage) -> bool:
+        """Tell whether it is that list, or was made from it: otherwise its operator did not know that one."""
+        return known.draw in (0, self.draw, *self.made_from)
+
+    def changed(self, obstacles: tuple[ListedObstacle, ...], draw: int) -> ObstaclesMessage:
+        """Return the list that an operator proposes in the place of this one."""
+        return msgspec.structs.replace(
+            self,
+            version=self.version + 1,
+            next_number=max([self.next_number, *(item.number + 1 for item in obstacles)]),
+            obstacles=obstacles,
+            draw=draw,
+            made_from=(*self.made_from, self.draw)[-MAX_ANCESTORS:],
+            proposed=True,
+        )
+
+    def shifted(self, by_us: int) -> ObstaclesMessage:
+        """Return the same list by a clock that is ahead by so much."""
+        moved = (
+            msgspec.structs.replace(item, since_utc_us=max(0, item.since_utc_us + by_us)) for item in self.obstacles
+        )
+        return msgspec.structs.replace(self, obstacles=tuple(moved))
 
 
 def first_list(obstacles: Iterable[Obstacle], utc_us: int, version: int = 1) -> ObstaclesMessage:

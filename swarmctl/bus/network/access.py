@@ -72,8 +72,8 @@ def _keys(speaker: Speaker, me: Speaker) -> list[str]:
     own = list(_OF_COMPUTERS)
     if speaker.operator or speaker == me:
         own += _OF_OPERATORS
-    elif not me.agents:
-        own.append(OBSTACLES.name)  # the station shows what hosts keep clear of, and commands nobody by it
+    elif me.operator:
+        own.append(OBSTACLES.name)  # who changes the list knows what others keep clear of; it is not adopted by itself
     agents = speaker.senders[1:]
     return [f"swarm/*/{speaker.name}/{name}" for name in own] + [
         f"swarm/*/{agent}/{name}" for agent in agents for name in _OF_AGENTS

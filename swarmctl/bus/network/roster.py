@@ -41,6 +41,11 @@ class Roster:
     relay: bool
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of all identities."""
+        return tuple(speaker.name for speaker in self.speakers)
+
+    @property
     def hosts(self) -> tuple[str, ...]:
         """Return the names of the identities that have agents."""
         return tuple(speaker.name for speaker in self.speakers if speaker.agents)

@@ -54,11 +54,12 @@ from swarmctl.process_priority import is_realtime_permitted
 from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.changed_parameters import read_originals
 from swarmctl.telemetry.recording.event_log import EventLog
-from swarmctl.wall_clock import utc_us
+from swarmctl.wall_clock import WallClock, utc_us
 
 _BUS_S = 20.0  # timeout for the router to answer
 _BUS_TRY_MS = 500
 _LAND_S = 30.0
+_CLOCK_TOLD_US = 100_000  # change of the clock that operators' commands are told
 _STOP_S = 10.0  # time for viewer and simulator to write their files
 _ROUTER_STOP_S = 3.0
 
@@ -180,7 +181,8 @@ class Launcher(Services):
         identity = None if part.links is None else part.links.identity
         self.context = RunContext(part.run, f"{SCHEME}{self._socket_dir}/bus.sock", directory, part.agents, identity)
         self._links = part.links
-        self.log = EventLog(directory / "launch.events.jsonl", "launch")
+        self.clock = WallClock()
+        self.log = EventLog(directory / "launch.events.jsonl", "launch", self.clock.utc_us)
         self.children: dict[str, Child] = {}
         self._announced: RunningLaunch | None = None
 
@@ -282,8 +284,16 @@ class Launcher(Services):
             view,
             context.identity,
             __version__,
+            utc_ahead_us=self.clock.utc_ahead_us(),
         )
         announce(self._announced)
+
+    def announce_clock(self) -> None:
+        """Publish the clock to the operator's commands again, where it was corrected."""
+        ahead_us, told = self.clock.utc_ahead_us(), self._announced
+        if told is not None and abs(ahead_us - (told.utc_ahead_us or 0)) > _CLOCK_TOLD_US:
+            self._announced = msgspec.structs.replace(told, utc_ahead_us=ahead_us)
+            announce(self._announced)
 
     def _announce_end(self) -> None:
         """Publish that nobody answers any more; that it can't be, without a descriptor left, stops no ending."""
@@ -311,7 +321,7 @@ class Launcher(Services):
                     listen,
                     identity=context.identity,
                     max_age_us=FOR_OPERATORS_US,
-                    utc_us=utc_us,
+                    utc_us=self.clock.utc_us,
                     lease_ms=self._config.bus.lease_ms,
                     connect_timeout_ms=_BUS_TRY_MS,
                 )

@@ -8,25 +8,28 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.json_messages import StatusMessage, decode_obstacles
+from swarmctl.bus.messages.json_messages import ObstaclesMessage, StatusMessage
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
-from swarmctl.bus.topics import OBSTACLES, TICK
+from swarmctl.bus.topics import TICK
 from swarmctl.config import Config, own_identity
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import unpack_tick
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.flight.host import refuse_unidentified, shared_run_name
 from swarmctl.ops.flight.launch import LaunchOptions, SwarmPart, judged, started
+from swarmctl.ops.orders.operator import list_setters
 from swarmctl.ops.processes import ROUTER, VIEWER
 from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.launch_result import LaunchResult
+from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper, adoption_text
 from swarmctl.ops.supervision.recovery import RECOVERY_S
 from swarmctl.ops.supervision.sender_clocks import SenderClocks
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
@@ -34,6 +37,7 @@ from swarmctl.ops.supervision.viewer_watch import ViewerWatch
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.recorder import Recorder
+from swarmctl.wall_clock import WallClock
 
 _STEP_S = 0.05
 _GONE_S = 3.0  # an agent that was done and is silent for so long has ended
@@ -60,12 +64,16 @@ def run_station(config: Config, options: LaunchOptions) -> int:
                 services.context.directory,
                 services.display,
                 note=services.log.write,
+                configured=config.obstacles,
+                list_setters=list_setters(services.context.identity),
+                clock=services.clock,
             )
             told = partial(tell, services.log, services.display)
             viewer = ViewerWatch(services.children.get(VIEWER), told, services.announce)
             router = services.children[ROUTER]
             while not (stop.count or watch.step()):
                 viewer.step()
+                services.announce_clock()
                 if router.poll() is not None:
                     watch.problems.append(f"router {router.how_it_ended()}; see {router.log}. The swarm flies on")
                     break
@@ -82,7 +90,7 @@ def run_station(config: Config, options: LaunchOptions) -> int:
 
 
 class SwarmWatch:
-    """Shows and records agents that run elsewhere.
+    """Shows and records agents that run elsewhere, and repeats the obstacles that operators set.
 
     Args:
         bus: receives their statuses and ticks.
@@ -90,6 +98,7 @@ class SwarmWatch:
         directory: run folder for what they report.
         display: shows them.
         note: is told of refused messages, see `Refusals`, of lists of obstacles, and of senders' clocks.
+        configured, list_setters, clock: see `ObstacleKeeper`.
         clock_s: monotonic time [s].
 
     Attributes:
@@ -105,10 +114,17 @@ class SwarmWatch:
         display: Display,
         note: Callable[..., None],
         clock_s: Callable[[], float] = time.monotonic,
+        *,
+        configured: Sequence[Obstacle] = (),
+        list_setters: Collection[str] = (),
+        clock: WallClock | None = None,
     ) -> None:
         self._bus, self._display, self._clock_s = bus, display, clock_s
         self._report, self._note = BusReport(bus, note, display), note
-        self._obstacles_version: int | None = None
+        self._obstacles = ObstacleKeeper(
+            bus, configured, clock or WallClock(), trusted=list_setters, refuse=self._report.refuse
+        )
+        self._recorded_list: ObstaclesMessage | None = None
         self._views = [AgentView(agent=agent) for agent in range(agents)]
         self._numbers = {agent_name(agent): agent for agent in range(agents)}
         self._recorders = {name: Recorder(directory, agent) for name, agent in self._numbers.items()}
@@ -135,11 +151,7 @@ class SwarmWatch:
                 view.status, view.received_s = status, now_s
                 if _flies(status):
                     self._flying.add(status.agent)
-        for _, payload in self._bus.receive(OBSTACLES):
-            message = decode_obstacles(payload)
-            if message is not None and message.replaces(self._obstacles_version):
-                self._obstacles_version = message.version
-                self._note("obstacles", **recorded_list(message))
+        self._keep_obstacles()
         self._report.step()
         self._display.show(self._views)
         lost = self._lost(now_s, RECOVERY_S)  # a host that lives would have landed its vehicle meanwhile
@@ -155,6 +167,23 @@ class SwarmWatch:
         self._clocks.close()
         for recorder in self._recorders.values():
             recorder.close()
+
+    def _keep_obstacles(self) -> None:
+        """Repeat the list of obstacles, record what hosts keep clear of, and say what operators have to know."""
+        for adoption in self._obstacles.receive():
+            if overruled := adoption_text(adoption.before, adoption.after):
+                self._tell("obstacles_overruled", overruled)
+        for text in self._obstacles.others():
+            self._tell("obstacles_elsewhere", text)
+        heard = self._obstacles.heard
+        if heard is not None and heard is not self._recorded_list:
+            self._recorded_list = heard
+            self._note("obstacles", **recorded_list(heard))
+        self._obstacles.repeat()
+
+    def _tell(self, event: str, text: str) -> None:
+        self._note(event, text=text)
+        self._display.print_line(text)
 
     def _record_ticks(self) -> None:
         arrived = self._bus.receive(TICK)

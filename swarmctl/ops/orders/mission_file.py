@@ -16,7 +16,6 @@ from swarmctl.errors import ConfigError
 from swarmctl.ops.orders.operator import read_statuses
 from swarmctl.ops.orders.order_delivery import Reply, deliver
 from swarmctl.ops.running_launches import RunningLaunch
-from swarmctl.wall_clock import utc_us
 
 _LEAD_S = 1.5  # from the order to the begin of the mission, the same for all
 _NUMBER_BYTES = 6  # of a digest: a number that a floating-point argument holds exactly
@@ -49,4 +48,4 @@ def mission_message(mission: MissionParams) -> MissionMessage:
 def _begin_utc_s(launch: RunningLaunch) -> float:
     """Return when the mission begins, by the clock of the agent that is farthest ahead."""
     clocks_us = [status.utc_us for status in read_statuses(launch).values()]
-    return max(clocks_us, default=utc_us()) * 1e-6 + _LEAD_S
+    return max(clocks_us, default=launch.utc_us()) * 1e-6 + _LEAD_S

@@ -1,13 +1,15 @@
 """The obstacles of a running launch: read, changed, and kept in files. Positions are those of now.
 
-Operators stamp what they add with the launch's clock, which repeats the list: their own may be another.
+Operators stamp what they add with the clock of who repeats the list: their own may be another.
 """
 
 from __future__ import annotations
 
 import json
+import secrets
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +25,16 @@ from swarmctl.bus.messages.json_messages import (
     decode_obstacles,
     encode_message,
 )
-from swarmctl.bus.topics import OBSTACLES
+from swarmctl.bus.network.identity_files import STATION
+from swarmctl.bus.network.roster import OwnIdentity
+from swarmctl.bus.topics import OBSTACLES, OPERATOR
 from swarmctl.configuration.problems import validated
 from swarmctl.configuration.source import read_tree
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import write_new
-from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, joined, vector
+from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, joined, list_keepers, list_setters, vector
 from swarmctl.ops.orders.order_delivery import no_operator
 from swarmctl.ops.running_launches import RunningLaunch
 
@@ -41,7 +45,10 @@ _OPTIONS = {  # of the command line, by key
     "visibility_m": "--visibility",
     "vel_ned_m_s": "--velocity",
 }
+_DRAW_BITS = 53
 _TRIES = 5  # of a change, while other operators are quicker
+_LISTEN_S = 2.5  # for who repeats the list: that is done once a second
+_CONVERGE_S = 1.5  # in which lists of one version become one, where those who keep them hear each other
 _SOURCE = "obstacle"  # of problems
 
 
@@ -51,20 +58,35 @@ class ObstacleFile(Params):
     obstacles: tuple[Obstacle, ...] = Field((), strict=False)
 
 
-def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:
-    """Return the obstacle list that the launch repeats.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeptList:
+    """Describes a list of obstacles, and who is known to keep it.
+
+    Attributes:
+        listed: the list, as of now.
+        others: those who are heard and keep another one.
+        unheard: those who are not heard, so that nothing is known of them.
+    """
+
+    listed: ObstaclesMessage
+    others: tuple[str, ...]
+    unheard: tuple[str, ...]
+
+
+def read_obstacles(launch: RunningLaunch) -> KeptList:
+    """Return the newest obstacle list that is repeated here.
 
     Raises:
         StartError: the launch does not answer in time.
     """
     with joined(launch) as bus:
-        return _received(bus, 0)
+        keepers = _Keepers(bus, launch.identity)
+        keepers.listen()
+        return keepers.kept(keepers.newest())
 
 
-def change_obstacles(
-    launch: RunningLaunch, change: Callable[[ObstaclesMessage], Sequence[ListedObstacle]]
-) -> ObstaclesMessage:
-    """Replace the obstacle list by what `change` makes of it, and wait until the launch repeats the new one.
+def change_obstacles(launch: RunningLaunch, change: Callable[[ObstaclesMessage], Sequence[ListedObstacle]]) -> KeptList:
+    """Replace the obstacle list by what `change` makes of it, and wait until all who are heard repeat the new one.
 
     Raises:
         ConfigError: `change` refuses, there would be too many, or this computer may not change them.
@@ -73,18 +95,97 @@ def change_obstacles(
     if launch.identity is not None and not launch.identity.speaker.operator:
         raise ConfigError(_SOURCE, [no_operator(launch)])
     with joined(launch) as bus:
-        old = _received(bus, 0)
+        keepers = _Keepers(bus, launch.identity)
+        keepers.listen()
         for _ in range(_TRIES):
+            old = keepers.newest()
             listed = tuple(change(old))
             if len(listed) > MAX_OBSTACLES:
                 would = f"there would be {len(listed)}, now there are {len(old.obstacles)}"
                 raise ConfigError(_SOURCE, [f"{would}; agents keep {MAX_OBSTACLES} at most"])
-            following = max([old.next_number, *(item.number + 1 for item in listed)])
-            new = msgspec.structs.replace(old, version=old.version + 1, next_number=following, obstacles=listed)
-            old = _received(bus, new.version, encode_message(new))
-            if old.obstacles == new.obstacles:
-                return old
+            new = old.changed(listed, secrets.randbits(_DRAW_BITS) | 1)
+            if keepers.propose(new):
+                return keepers.kept(new)
     raise StartError("obstacle: others change the list at the same time; nothing of this was changed")
+
+
+class _Keepers:
+    """Hears which lists are repeated by whom, and proposes another one.
+
+    Args:
+        bus: of the launch.
+        identity: the own one; None: a launch on one computer.
+    """
+
+    def __init__(self, bus: Bus, identity: OwnIdentity | None) -> None:
+        self._bus = bus
+        self._own = OPERATOR if identity is None else identity.name
+        self._setters = list_setters(identity)
+        may_end = () if identity is None else (STATION,)
+        self._expected = [name for name in list_keepers(identity) if name == self._own or name not in may_end]
+        self._heard: dict[str, tuple[ObstaclesMessage, float]] = {}  # newest list of each, and when
+
+    def listen(self) -> None:
+        """Listen until all who may keep a list have repeated theirs, or time is up.
+
+        Raises:
+            StartError: the own launch does not answer.
+        """
+        began_s = time.monotonic()
+        while not self._heard.keys() >= set(self._expected):
+            waited_s = time.monotonic() - began_s
+            if waited_s >= (_LISTEN_S if self._own in self._heard else ANSWER_S):
+                break
+            self._receive()
+        if self._own not in self._heard:
+            raise StartError(f"obstacle: the launch did not answer within {ANSWER_S:.0f} s; see: swarmctl status")
+
+    def newest(self) -> ObstaclesMessage:
+        """Return the newest list that the own launch can go on from, as of now by the clock of who repeats it."""
+        own, _ = self._heard[self._own]
+        lists = [heard for heard in self._heard.values() if not heard[0].is_too_far_from(own)]
+        message, at_s = max(lists, key=lambda heard: heard[0].rank)
+        return _as_of_now(message, at_s)
+
+    def propose(self, new: ObstaclesMessage) -> bool:
+        """Propose a list until all who are heard keep it, or time is up; returns false if an operator was quicker.
+
+        Raises:
+            StartError: the own launch does not take it.
+        """
+        began_s = time.monotonic()
+        while (waited_s := time.monotonic() - began_s) < ANSWER_S:
+            self._bus.publish(OBSTACLES, encode_message(_as_of_now(new, began_s)))
+            self._receive()
+            others = {name: message for name, (message, _) in self._heard.items() if not message.includes(new)}
+            if not others:
+                return True
+            rivals = [name for name in others if name in self._setters and others[name].version >= new.version]
+            if rivals and (waited_s > _CONVERGE_S or not self.newest().includes(new)):
+                return False
+        if not self._heard[self._own][0].includes(new):
+            raise StartError(
+                f"obstacle: the launch did not take the list within {ANSWER_S:.0f} s; see: swarmctl status"
+            )
+        return True
+
+    def kept(self, listed: ObstaclesMessage) -> KeptList:
+        """Return who is known to keep a list, or one that was made from it."""
+        others = [name for name, (message, _) in self._heard.items() if not message.includes(listed)]
+        unheard = [name for name in self._expected if name not in self._heard]
+        return KeptList(listed=self.newest(), others=tuple(sorted(others)), unheard=tuple(unheard))
+
+    def _receive(self) -> None:
+        time.sleep(REPEAT_S)
+        for sender, payload in self._bus.receive(OBSTACLES):
+            message = decode_obstacles(payload)
+            if message is not None and not message.proposed:
+                self._heard[sender] = (message, time.monotonic())
+
+
+def _as_of_now(message: ObstaclesMessage, at_s: float) -> ObstaclesMessage:
+    """Return a list as it was stamped at a monotonic time, stamped now."""
+    return msgspec.structs.replace(message, utc_us=message.utc_us + round((time.monotonic() - at_s) * 1e6))
 
 
 def added(known: ObstaclesMessage, obstacles: Sequence[Obstacle]) -> list[ListedObstacle]:
@@ -214,16 +315,3 @@ def _validated(values: dict[str, Any], problems: list[str]) -> Obstacle:
     if problems:
         raise ConfigError(_SOURCE, problems)
     return described
-
-
-def _received(bus: Bus, least_version: int, say: bytes | None = None) -> ObstaclesMessage:
-    deadline_s = time.monotonic() + ANSWER_S
-    while time.monotonic() < deadline_s:
-        if say is not None:
-            bus.publish(OBSTACLES, say)
-        time.sleep(REPEAT_S)
-        for _, payload in bus.receive(OBSTACLES):
-            message = decode_obstacles(payload)
-            if message is not None and message.version >= least_version:
-                return message
-    raise StartError(f"obstacle: the launch did not answer within {ANSWER_S:.0f} s; see: swarmctl status")

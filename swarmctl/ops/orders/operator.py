@@ -21,7 +21,6 @@ from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
 from swarmctl.bus.topics import ANSWER, OBSTACLES, OPERATOR, STATUS
 from swarmctl.errors import StartError
 from swarmctl.ops.running_launches import RunningLaunch, refuse_ending, runs
-from swarmctl.wall_clock import utc_us
 
 ANSWER_S = 5.0  # longest wait for what is asked over the bus
 REPEAT_S = 0.2
@@ -43,7 +42,7 @@ def joined(launch: RunningLaunch) -> Iterator[Bus]:
             {STATUS: senders, ANSWER: senders, OBSTACLES: list_keepers(launch.identity)},
             identity=launch.identity,
             max_age_us=FOR_OPERATORS_US,
-            utc_us=utc_us,
+            utc_us=launch.utc_us,
             connect_timeout_ms=3000,
         )
         with contextlib.closing(bus):
@@ -54,13 +53,15 @@ def joined(launch: RunningLaunch) -> Iterator[Bus]:
 
 
 def list_keepers(identity: OwnIdentity | None) -> tuple[str, ...]:
-    """Return the senders whose list of obstacles an operator, or a supervisor, takes for that of the swarm.
-
-    The station, which keeps none, takes that of any host.
-    """
+    """Return the senders whose list of obstacles is heard here: an operator has to know all lists, to change them."""
     if identity is None:
         return (OPERATOR,)
-    return identity.roster.commanders(identity.name) if identity.speaker.agents else identity.roster.hosts
+    return identity.roster.names if identity.speaker.operator else list_setters(identity)
+
+
+def list_setters(identity: OwnIdentity | None) -> tuple[str, ...]:
+    """Return the senders whose list of obstacles a computer adopts by itself."""
+    return (OPERATOR,) if identity is None else identity.roster.commanders(identity.name)
 
 
 def view_address(launch: RunningLaunch) -> str:

@@ -22,7 +22,6 @@ from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, joined
 from swarmctl.ops.running_launches import RunningLaunch, refuse_ending
-from swarmctl.wall_clock import utc_us
 
 _POLL_S = 0.02
 _MOST_MESSAGES = 32  # of one repetition, so that they fit into an agent's ring
@@ -207,20 +206,20 @@ def deliver(
                 repeated_s = time.monotonic() + REPEAT_S
                 for topic, payload in before:
                     bus.publish(topic, payload)
-                for message in delivery.messages(utc_us()):
+                for message in delivery.messages(launch.utc_us()):
                     bus.publish(COMMAND, message)
             time.sleep(_POLL_S)
-            delivery.receive(bus, utc_us())
-        _wait_for_phases(delivery, bus)
+            delivery.receive(bus, launch.utc_us())
+        _wait_for_phases(launch, delivery, bus)
     replies = delivery.replies()
     if not any(reply.answer for reply in replies):
         refuse_ending(launch)
     return replies
 
 
-def _wait_for_phases(delivery: OrderDelivery, bus: Bus) -> None:
+def _wait_for_phases(launch: RunningLaunch, delivery: OrderDelivery, bus: Bus) -> None:
     """Wait until every agent that has answered has published its phase too, at most two periods of the status."""
     until_s = time.monotonic() + 0.5
     while time.monotonic() < until_s and any(r.answer is not None and r.phase is None for r in delivery.replies()):
         time.sleep(_POLL_S)
-        delivery.receive(bus, utc_us())
+        delivery.receive(bus, launch.utc_us())

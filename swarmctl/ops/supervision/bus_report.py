@@ -11,7 +11,7 @@ from swarmctl.bus.refusals import HARMLESS, IDENTITY, MALFORMED, Refusals
 from swarmctl.bus.silence import SessionWatch
 from swarmctl.bus.topics import STATUS
 from swarmctl.ops.supervision.status_table import Display
-from swarmctl.wall_clock import utc_us
+from swarmctl.wall_clock import monotonic_us
 
 _REOPENED = "another session of the bus has taken over: the one before may have been deaf"
 
@@ -38,17 +38,18 @@ class BusReport:
             if status is not None and sender == agent_name(status.agent):
                 yield status
             else:
-                self._refuse(sender, STATUS.name, MALFORMED if status is None else IDENTITY)
+                self.refuse(sender, STATUS.name, MALFORMED if status is None else IDENTITY)
 
     def step(self) -> None:
         """Report what is new: refused messages, the first of each kind in words, and another session."""
         for message in self._bus.refused():
-            self._refuse(*message)
-        self._refusals.report(utc_us())
+            self.refuse(*message)
+        self._refusals.report(monotonic_us())
         if self._sessions.step() and not self._has_told_reopened:  # while there is nobody, it happens again and again
             self._has_told_reopened = True
             self._display.print_line(_REOPENED)
 
-    def _refuse(self, sender: str, topic: str, reason: str) -> None:
-        if self._refusals.add(sender, topic, reason, utc_us()) == 1 and reason not in HARMLESS:
+    def refuse(self, sender: str, topic: str, reason: str) -> None:
+        """Count a message that is not taken, and say the first of its kind."""
+        if self._refusals.add(sender, topic, reason, monotonic_us()) == 1 and reason not in HARMLESS:
             self._display.print_line(f"{topic} in the name of {sender} refused: {reason}")

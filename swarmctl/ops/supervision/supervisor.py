@@ -18,19 +18,20 @@ from swarmctl.config import Config
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
+from swarmctl.ops.orders.operator import list_setters
 from swarmctl.ops.orders.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
-from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
+from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper, adoption_text
 from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.supervision.standstill import Standstill
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
 from swarmctl.telemetry.recording.event_log import EventLog
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
-from swarmctl.wall_clock import utc_us
+from swarmctl.wall_clock import WallClock
 
 _STEP_S = 0.05
 _FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
@@ -53,9 +54,14 @@ class Services:
     log: EventLog
     children: dict[str, Child]  # by name; agents have their names on the bus
     bus: Bus | None = None
+    clock: WallClock  # as agents have it: it follows steps of UTC slowly
 
     def announce(self, view: str) -> None:
         """Publish the address of the live view to the operator's commands."""
+        raise NotImplementedError
+
+    def announce_clock(self) -> None:
+        """Publish the clock to the operator's commands again, where it was corrected."""
         raise NotImplementedError
 
     def restart_router(self) -> None:
@@ -82,8 +88,14 @@ class FlightSupervisor:
         self._viewer_watch = ViewerWatch(services.children.get(VIEWER), self._announce, services.announce)
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
         self._elsewhere: dict[int, AgentView] = {}  # agents of other computers, as they were heard last
-        self._obstacles = ObstacleKeeper(self._bus, config.obstacles)
         self._report = BusReport(self._bus, services.log.write, display)
+        self._obstacles = ObstacleKeeper(
+            self._bus,
+            config.obstacles,
+            services.clock,
+            trusted=list_setters(services.context.identity),
+            refuse=self._report.refuse,
+        )
         self._hearing = Hearing(self._bus, self._announce)
         self._standstill = Standstill()
         self._started_s = self._stepped_s = time.monotonic()
@@ -160,9 +172,13 @@ class FlightSupervisor:
             if status.phase == Phase.TRACK:  # also of a mission that an operator has set
                 self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + status.ends_in_s)
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
-        for message in self._obstacles.receive():
-            text = f"{len(message.obstacles)} obstacles, set by an operator"
-            self._announce("obstacles", text, **recorded_list(message))
+        for adoption in self._obstacles.receive():
+            text = f"{len(adoption.after.obstacles)} obstacles, set by an operator"
+            self._announce("obstacles", text, **recorded_list(adoption.after))
+            if overruled := adoption_text(adoption.before, adoption.after):
+                self._announce("obstacles_overruled", overruled)
+        for text in self._obstacles.others():
+            self._announce("obstacles_elsewhere", text)
         self._report.step()
 
     def _watch_essential_processes(self) -> None:
@@ -207,7 +223,7 @@ class FlightSupervisor:
         clocks_us = [
             view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in views if view.status is not None
         ]
-        for message in order_messages(numbered(order), agent, utc_us(), clocks_us):
+        for message in order_messages(numbered(order), agent, self._services.clock.utc_us(), clocks_us):
             self._bus.publish(topic, message)
 
     def _recover(self, view: AgentView, code: int) -> None:
@@ -268,6 +284,7 @@ class FlightSupervisor:
     def _speak(self) -> None:
         now_s = time.monotonic()
         self._obstacles.repeat()
+        self._services.announce_clock()
         if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
             self._land_said_s = now_s
             self._repeat_land_order(now_s - self._land_ordered_s)

@@ -5,17 +5,19 @@ Heavy modules are imported inside of them.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from swarmctl.errors import EXIT_OK
+from swarmctl.errors import EXIT_OK, MissionError
 from swarmctl.ops.verbs.orders import AsJson, Run
 
 if TYPE_CHECKING:
     from swarmctl.bus.messages.json_messages import ListedObstacle, ObstaclesMessage
+    from swarmctl.ops.orders.obstacle_list import KeptList
 
 obstacle_app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Change the obstacles of a running launch."
@@ -31,7 +33,9 @@ def obstacle_list(run: Run = None, as_json: AsJson = False) -> int:
     from swarmctl.ops.orders import obstacle_list
 
     launch = running_launches.find_launch(run)
-    return _show(launch.run, obstacle_list.read_obstacles(launch), as_json)
+    kept = obstacle_list.read_obstacles(launch)
+    _show(launch.run, kept, as_json)
+    return EXIT_OK
 
 
 @obstacle_app.command("add")
@@ -118,25 +122,37 @@ def obstacle_save(
     from swarmctl.ops import running_launches
     from swarmctl.ops.orders import obstacle_list
 
-    known = obstacle_list.read_obstacles(running_launches.find_launch(run))
+    known = obstacle_list.read_obstacles(running_launches.find_launch(run)).listed
     obstacle_list.write_file(file, known)
     print(obstacle_list.as_json(known) if as_json else f"{len(known.obstacles)} obstacles: {file}")
     return EXIT_OK
 
 
 def _change(run: str | None, as_json: bool, change: Callable[[ObstaclesMessage], Sequence[ListedObstacle]]) -> int:
+    """Change the list, and show the new one.
+
+    Raises:
+        MissionError: somebody is heard and keeps another list.
+    """
     from swarmctl.ops import running_launches
     from swarmctl.ops.orders import obstacle_list
 
     launch = running_launches.find_launch(run)
-    return _show(launch.run, obstacle_list.change_obstacles(launch, change), as_json)
+    kept = obstacle_list.change_obstacles(launch, change)
+    _show(launch.run, kept, as_json)
+    if kept.others:
+        raise MissionError(f"obstacle: not taken by {', '.join(kept.others)}")  # who are heard
+    return EXIT_OK
 
 
-def _show(run: str, known: ObstaclesMessage, as_json: bool) -> int:
+def _show(run: str, kept: KeptList, as_json: bool) -> None:
     from swarmctl.ops.orders import obstacle_list
 
     if as_json:
-        print(obstacle_list.as_json(known))
+        print(obstacle_list.as_json(kept.listed))
     else:
-        print("\n".join([f"obstacle: {run}", *obstacle_list.lines_of(known)]))
-    return EXIT_OK
+        print("\n".join([f"obstacle: {run}", *obstacle_list.lines_of(kept.listed)]))
+    if kept.others:
+        print(f"obstacle: another list is kept by {', '.join(kept.others)}", file=sys.stderr)
+    if kept.unheard:
+        print(f"obstacle: nothing is heard from {', '.join(kept.unheard)}, which may keep another", file=sys.stderr)

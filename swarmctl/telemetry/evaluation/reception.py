@@ -18,11 +18,11 @@ _ALLOWED = {  # refusals by one agent for each peer and topic; other reasons are
     "malformed": 50,  # the paths of one second
     "future": 50,
 }
-_OF_ANYBODY = ("unsealed", "forged")  # also in the name of an operator; without seals anybody may use that name
+_ALLOWED_LISTS = {"malformed": 5, "future": 5, "late": 5}  # of obstacles, repeated once a second, valid for a minute
 
 
 def refused_peers(events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield violations: messages under a peer's name that were forged or could not be decoded."""
+    """Yield violations: messages in the name of an agent or operator that were forged, or could not be used."""
     counts: dict[tuple[str, str, str], dict[str, int]] = defaultdict(dict)  # (name, topic, reason): last count by agent
     for event in events:
         if event.get("event") == "refused" and isinstance(event.get("count"), int):
@@ -30,8 +30,8 @@ def refused_peers(events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             counts[sender, topic, reason][str(event.get("source"))] = event["count"]
     found: dict[str, list[tuple[str, str, int, list[str]]]] = defaultdict(list)
     for (sender, topic, reason), by in sorted(counts.items()):
-        told = {agent: count for agent, count in by.items() if count > _ALLOWED.get(reason, count)}
-        if told and (sender.startswith("agent-") or reason in _OF_ANYBODY):
+        allowed = _ALLOWED | _ALLOWED_LISTS if topic == "obstacles" else _ALLOWED
+        if told := {agent: count for agent, count in by.items() if count > allowed.get(reason, count)}:
             found[sender].append((topic, reason, sum(told.values()), sorted(told)))
     for sender, rows in found.items():
         kinds = ", ".join(f"{topic} {reason} {count}" for topic, reason, count, _ in rows)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,11 @@ from swarmctl.wall_clock import monotonic_us, utc_us
 class EventLog:
     """Appends events of one source to a file; a full disk loses events, never the flight."""
 
-    def __init__(self, path: Path, source: str) -> None:
-        self._path, self._source = path, source
+    def __init__(self, path: Path, source: str, utc_us: Callable[[], int] = utc_us) -> None:
+        self._path, self._source, self._utc_us = path, source, utc_us
 
     def write(self, event: str, **fields: Any) -> None:
         """Append one row with both clocks."""
-        stamp = {"utc_us": utc_us(), "t_us": monotonic_us(), "source": self._source, "event": event}
+        stamp = {"utc_us": self._utc_us(), "t_us": monotonic_us(), "source": self._source, "event": event}
         with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({**stamp, **fields}) + "\n")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.json_messages import decode_obstacles
+from swarmctl.bus.messages.json_messages import ObstaclesMessage, decode_obstacles
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import unpack_tick
 from swarmctl.core.types import Array
@@ -43,7 +43,7 @@ class Feed:
     def __init__(self, bus: Bus, agents: int) -> None:
         self._bus = bus
         self._numbers = {agent_name(agent): agent for agent in range(agents)}
-        self._version = -1
+        self._listed: ObstaclesMessage | None = None
         self._clocks = [AgentClock() for _ in range(agents)]
         self._epoch_us: int | None = None
         self.received = 0
@@ -75,8 +75,8 @@ class Feed:
             message = decode_obstacles(payload)
             if message is None:
                 self.malformed += 1
-            elif message.version > self._version:
-                self._version = message.version
+            elif not message.proposed and message.replaces(self._listed):
+                self._listed = message
                 newest = tuple(item.at(message.utc_us) for item in message.obstacles)
         return newest
 

@@ -26,7 +26,7 @@ from swarmctl.process_lifetime import StopRequest, die_with_parent
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 from swarmctl.telemetry.view.recordings import APPLICATION, RECORDING, has_display, open_viewer
 from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_ports
-from swarmctl.wall_clock import utc_us
+from swarmctl.wall_clock import WallClock
 
 URL_FILE = "viewer.url"
 _EXIT_TIMEOUT_S = 4.0  # longest time from SIGTERM to the exit, whatever hangs
@@ -93,7 +93,7 @@ def _run(options: argparse.Namespace, flight: ViewedFlight, stop: StopRequest) -
             listen,
             identity=identity,
             max_age_us=FOR_OPERATORS_US,
-            utc_us=utc_us,
+            utc_us=WallClock().utc_us,
         )
 
     bus = _interruptible(join, stop)

@@ -303,6 +303,35 @@ def test_a_moving_obstacle_is_avoided_where_it_is_now_not_where_it_was_when_it_w
     assert [body.pos_ned_m[0] for body in bodies] == pytest.approx([9.0, 9.0], abs=0.05)
 
 
+def test_of_two_lists_of_one_version_agents_take_what_the_keepers_take_and_no_proposal() -> None:
+    bench = Bench()
+    first = first_list((BALL,), bench.clock.utc_us())
+    one, three = (
+        msgspec.structs.replace(first_list((BALL,) * count, bench.clock.utc_us(), 2), draw=draw)
+        for count, draw in ((1, 5), (3, 9))
+    )
+    proposed = msgspec.structs.replace(first_list((BALL,) * 4, bench.clock.utc_us(), 3), draw=7, proposed=True)
+    for message in (first, one, three, one, proposed):
+        bench.operator.publish(topics.OBSTACLES, encode_message(message))
+        bench.tick()
+    assert bench.seen == 3
+    assert bench.rejected == {}
+
+
+def test_a_repeated_list_corrects_the_time_of_obstacles_and_they_stay_seen() -> None:
+    bench = Bench()
+    train = BALL.model_copy(update={"vel_ned_m_s": (-2.0, 0.0, 0.0)})
+    message = first_list((BALL, train), bench.clock.utc_us())
+    for later in (message, message.shifted(-1_000_000)):
+        bench.operator.publish(topics.OBSTACLES, encode_message(later))
+        bench.tick()
+        assert bench.seen == 2
+    north_m = BALL.center_ned_m[0]
+    keep_outs = bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, phase=Phase.TRACK)
+    assert [k.pos_ned_m[0][0] for k in keep_outs] == pytest.approx([north_m, north_m - 2.0], abs=0.1)
+    assert bench.world_model.landmarks() == [BALL]
+
+
 def test_obstacles_that_were_seen_stay_known_when_another_is_added() -> None:
     bench = Bench()
     bench.set_obstacles(1, 1)

@@ -8,6 +8,7 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from swarmctl.ops.orders import obstacle_list
 from swarmctl.ops.orders.order_delivery import Reply
 from swarmctl.ops.running_launches import RunningLaunch
 from swarmctl.ops.verbs import orders
+from swarmctl.wall_clock import WallClock
 
 Run = Callable[..., int]
 HEAVY = ("numpy", "scipy", "osqp", "zenoh", "rerun", "pyarrow", "pydantic", "mavsdk", "pymavlink", "psutil", "msgspec")
@@ -414,6 +416,16 @@ def test_a_launch_is_found_after_the_computers_clock_has_stepped(
     monkeypatch.setattr("psutil._pslinux.boot_time", lambda: booted_s + 3600.0)
     assert psutil.Process().create_time() == pytest.approx(before_s + 3600.0), "a step moves both"
     assert running_launches.find_launch(None) == launch
+
+
+def test_verbs_have_the_clock_of_the_launch_after_the_computers_has_stepped(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = WallClock()
+    launch = RunningLaunch("run", "unixsock-stream//x", 1, 0.0, 3, "x", utc_ahead_us=clock.utc_ahead_us())
+    before_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: before_ns() + 95 * 10**9)
+    assert launch.utc_us() == pytest.approx(before_ns() // 1000, abs=1_000_000)
+    told_none = RunningLaunch("run", "unixsock-stream//x", 1, 0.0, 3, "x")
+    assert told_none.utc_us() == pytest.approx(time.time_ns() // 1000, abs=1_000_000)
 
 
 @pytest.mark.usefixtures("nobody")

@@ -477,6 +477,28 @@ def test_forged_messages_are_a_violation_and_network_faults_are_not() -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("topic", "reason", "few", "many"),
+    [
+        ("obstacles", "future", 5, 6),
+        ("obstacles", "late", 5, 6),
+        ("obstacles", "malformed", 5, 6),
+        ("obstacles", "sequence", 0, 1),
+        ("command", "sequence", 0, 1),
+        ("ended", "identity", 0, 1),
+    ],
+)
+def test_what_is_refused_of_an_operator_or_a_computer_is_a_violation_as_of_an_agent(
+    topic: str, reason: str, few: int, many: int
+) -> None:
+    for sender in ("operator", "alpha"):
+        for count, found in ((few, 0), (many, 1)):
+            events = [refused(0, reason, count, sender, topic)]
+            summary = evaluate(run(APART, events=events), Rules(agents=2, required_separation_m=0.5), "completed")
+            told = f"messages in the name of {sender} were refused ({topic} {reason} {count}) by agent-0"
+            assert summary["violations"] == [told] * found
+
+
 def test_the_peer_unresponsive_for_longest_is_named() -> None:
     def row(by: int, agent: int, at_s: float, **fields: Any) -> dict[str, Any]:
         return {"source": f"agent-{by}", "event": "unresponsive", "agent": agent, "utc_us": round(at_s * 1e6), **fields}

@@ -29,6 +29,7 @@ from swarmctl.ops.preflight import ReservedPorts
 from swarmctl.ops.processes import ROUTER
 from swarmctl.ops.running_launches import RunningLaunch, announce, find_launch
 from swarmctl.ops.supervision.launch_result import LaunchResult
+from swarmctl.wall_clock import WallClock
 
 ENDING = r"circle.* is ending: nobody answers any more, it writes its report to .*run"
 
@@ -188,3 +189,23 @@ def test_a_violation_is_told_by_the_exit_code_unless_ctrl_c_has_ended_the_flight
     result: LaunchResult, violated: bool, code: int
 ) -> None:
     assert result.exit_code(violated) == code
+
+
+def test_a_launch_tells_verbs_its_clock_again_where_it_was_corrected(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    now_ns, stepped_ns = 0, 0
+    part = SwarmPart(run="circle-1a", agents=(0,))
+    launcher = Launcher(Config(), LaunchOptions(), cast(ReservedPorts, None), tmp_path, part=part)
+    launcher.clock = WallClock(lambda: now_ns, lambda: now_ns + 10**15 + stepped_ns)
+    launcher.announce("")
+    told_us = []
+    stepped_ns = 30 * 10**9
+    for elapsed_s in (0, 5, 20):
+        now_ns = elapsed_s * 10**9
+        launcher.announce_clock()
+        told_us.append(find_launch(str(tmp_path)).utc_ahead_us)
+    launcher.display.close()
+    assert told_us == [10**12, 10**12, 10**12 + 200_000], "1 % of the time that has passed, in steps of 0.1 s"

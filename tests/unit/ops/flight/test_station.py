@@ -13,7 +13,7 @@ import pytest
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
-from swarmctl.bus.messages.json_messages import encode_message, first_list
+from swarmctl.bus.messages.json_messages import ListedObstacle, decode_obstacles, encode_message, first_list
 from swarmctl.bus.topics import OBSTACLES, STATUS, TICK
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.obstacle import Obstacle
@@ -21,6 +21,7 @@ from swarmctl.core.types import Phase
 from swarmctl.ops.flight.station import SwarmWatch
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
+from swarmctl.wall_clock import WallClock
 from tests.builders import status_message
 
 BALL = Obstacle(center_ned_m=(5.0, 0.0, -2.0), radius_m=0.5, keep_out_m=1.0)
@@ -44,6 +45,37 @@ def test_lists_of_obstacles_are_recorded_once_for_the_referee(tmp_path: Path) ->
     assert [row["version"] for row in noted] == [1, 2, 3]
     (judged,) = recorded_obstacles((), noted)
     assert (judged.obstacle, judged.since_utc_us, judged.until_utc_us) == (BALL, 2_000_000, 3_000_000)
+
+
+def test_a_station_repeats_what_operators_set_and_says_that_a_list_of_its_own_was_overruled(tmp_path: Path) -> None:
+    now_us = 50_000_000
+    hub, said = LocalHub(lambda: now_us), StringIO()
+    bus = hub.connect("station", {STATUS: [], TICK: [], OBSTACLES: ["alpha", "station"]})
+    alpha = hub.connect("alpha", {OBSTACLES: ["station"]})
+    clock, noted = WallClock(lambda: 1000 * now_us, lambda: 1000 * now_us), list[str]()
+    watch = SwarmWatch(
+        bus,
+        0,
+        tmp_path,
+        PlainLines(said),
+        lambda event, **_: noted.append(event),
+        list_setters=("alpha", "station"),
+        clock=clock,
+    )
+    first = first_list((), now_us)
+    ball = ListedObstacle(number=0, since_utc_us=now_us, obstacle=BALL)
+    for sender, draw in (("station", 5), ("alpha", 9)):
+        message = first.changed((ball,) if sender == "station" else (), draw)
+        hub.carry(sender, OBSTACLES, encode_message(msgspec.structs.replace(message, proposed=sender == "station")))
+        now_us += 1_100_000
+        watch.step()
+    watch.close()
+    now_us += 1
+    repeated = [decode_obstacles(payload) for _, payload in alpha.receive(OBSTACLES)]
+    assert [(m.draw, m.proposed) for m in repeated if m][-2:] == [(5, False), (9, False)]
+    assert "obstacles_overruled" in noted
+    assert "version 2 of the obstacles was overruled" in said.getvalue()
+    assert "obstacle 0 of it is gone" in said.getvalue()
 
 
 class Watched:

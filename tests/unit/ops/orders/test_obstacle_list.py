@@ -21,9 +21,12 @@ from swarmctl.bus.messages.json_messages import (
 from swarmctl.bus.topics import OBSTACLES, OPERATOR
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.errors import ConfigError, StartError
+from swarmctl.errors import ConfigError, MissionError, StartError
+from swarmctl.ops import running_launches
 from swarmctl.ops.orders import obstacle_list
+from swarmctl.ops.orders.operator import list_keepers
 from swarmctl.ops.running_launches import RunningLaunch
+from swarmctl.ops.verbs.obstacles import obstacle_remove
 from tests.benches.swarm_of_hosts import SwarmOfHosts
 
 UTC_US = 1_700_000_000_000_000
@@ -48,8 +51,8 @@ class Launch:
         self.hub = LocalHub(lambda: self.now_us)
         self.known = first_list((BALL, TRAIN), UTC_US)
         self.rival: list[ObstaclesMessage] = []  # lists of another operator, each adopted before ours arrives
-        self.bus = self.hub.connect("launch", {OBSTACLES: [OPERATOR]})
-        self.operator = self.hub.connect(OPERATOR, {OBSTACLES: ["launch"]})
+        self.bus = self.hub.connect("launch", {OBSTACLES: ["verb"]})
+        self.operator = self.hub.connect("verb", {OBSTACLES: [OPERATOR]})
         monkeypatch.setattr(obstacle_list, "joined", self.joined)
         monkeypatch.setattr(time, "sleep", self.pass_time)
         monkeypatch.setattr(time, "monotonic", lambda: self.now_us * 1e-6)
@@ -65,9 +68,10 @@ class Launch:
             assert message is not None
             if self.rival:
                 self.known = self.rival.pop(0)
-            if message.replaces(self.known.version):
-                self.known = message
-        self.bus.publish(OBSTACLES, encode_message(msgspec.structs.replace(self.known, utc_us=self.now_us)))
+            if message.replaces(self.known):
+                self.known = msgspec.structs.replace(message, proposed=False)
+        told = msgspec.structs.replace(self.known, utc_us=self.now_us)
+        self.hub.carry(OPERATOR, OBSTACLES, encode_message(told))
         self.now_us += round(seconds * 5e5)
 
 
@@ -78,17 +82,17 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> Launch:
 
 def test_a_number_stays_and_no_other_obstacle_gets_it(launch: Launch) -> None:
     change = obstacle_list.change_obstacles
-    assert numbers(change(LAUNCH, lambda known: obstacle_list.added(known, [BALL]))) == [0, 1, 2]
-    assert numbers(change(LAUNCH, lambda known: obstacle_list.removed(known, [0, 2]))) == [1]
-    assert numbers(change(LAUNCH, lambda known: obstacle_list.added(known, [BALL, BALL]))) == [1, 3, 4]
+    assert numbers(change(LAUNCH, lambda known: obstacle_list.added(known, [BALL])).listed) == [0, 1, 2]
+    assert numbers(change(LAUNCH, lambda known: obstacle_list.removed(known, [0, 2])).listed) == [1]
+    assert numbers(change(LAUNCH, lambda known: obstacle_list.added(known, [BALL, BALL])).listed) == [1, 3, 4]
     assert numbers(launch.known) == [1, 3, 4]
 
 
 def test_a_change_is_made_again_where_another_operator_was_quicker(launch: Launch) -> None:
     theirs = obstacle_list.added(launch.known, [TRAIN])
     launch.rival = [msgspec.structs.replace(launch.known, version=2, next_number=3, obstacles=tuple(theirs))]
-    message = obstacle_list.change_obstacles(LAUNCH, lambda known: obstacle_list.added(known, [BALL]))
-    assert numbers(message) == [0, 1, 2, 3]
+    kept = obstacle_list.change_obstacles(LAUNCH, lambda known: obstacle_list.added(known, [BALL]))
+    assert numbers(kept.listed) == [0, 1, 2, 3]
     assert [item.obstacle for item in launch.known.obstacles] == [BALL, TRAIN, TRAIN, BALL]
 
 
@@ -179,3 +183,75 @@ def test_a_host_without_an_operators_identity_changes_no_list() -> None:
     launch = RunningLaunch("hosts-1a", "unixsock-stream//x", 1, 0.0, 3, "runs/x", "", identity)
     with pytest.raises(ConfigError, match="bravo has no operator's identity"):
         obstacle_list.change_obstacles(launch, lambda known: known.obstacles)
+
+
+class Hosts:
+    """Keepers of several computers, as an operator's verb at alpha hears them: what they repeat, and who is deaf."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, versions: dict[str, int], deaf: tuple[str, ...] = ()) -> None:
+        self.now_us, self.deaf = UTC_US, deaf
+        self.hub = LocalHub(lambda: self.now_us)
+        identity = SwarmOfHosts.of(Path("nowhere")).identity("alpha")
+        self.launch = RunningLaunch("hosts-1a", "unixsock-stream//x", 1, 0.0, 3, "runs/x", "", identity)
+        self.known = {
+            name: first_list((BALL,) * min(version, 3), UTC_US, version=version) for name, version in versions.items()
+        }
+        self.verb = self.hub.connect("verb", {OBSTACLES: list_keepers(identity)})
+        self.ears = {name: self.hub.connect(f"at {name}", {OBSTACLES: ["verb"]}) for name in versions}
+        monkeypatch.setattr(obstacle_list, "joined", self.joined)
+        monkeypatch.setattr(time, "sleep", self.pass_time)
+        monkeypatch.setattr(time, "monotonic", lambda: self.now_us * 1e-6)
+
+    @contextlib.contextmanager
+    def joined(self, launch: RunningLaunch) -> Iterator[object]:
+        yield self.verb
+
+    def pass_time(self, seconds: float) -> None:
+        self.now_us += round(seconds * 5e5)
+        for name, ear in self.ears.items():
+            for _, payload in ear.receive(OBSTACLES):
+                message = decode_obstacles(payload)
+                assert message is not None
+                assert message.utc_us == pytest.approx(self.now_us, abs=500_000), "stamped when it is sent"
+                if message.replaces(self.known[name]) and name not in self.deaf:
+                    self.known[name] = msgspec.structs.replace(message, proposed=False)
+            told = msgspec.structs.replace(self.known[name], utc_us=self.now_us)
+            self.hub.carry(name, OBSTACLES, encode_message(told))
+        self.now_us += round(seconds * 5e5)
+
+    def add(self) -> obstacle_list.KeptList:
+        return obstacle_list.change_obstacles(self.launch, lambda known: obstacle_list.added(known, [TRAIN]))
+
+
+def test_a_change_goes_on_from_the_newest_list_that_any_host_keeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Alpha was started again, and begins with the first version."""
+    hosts = Hosts(monkeypatch, {"alpha": 1, "bravo": 3, "charlie": 3})
+    kept = hosts.add()
+    assert {message.version for message in hosts.known.values()} == {4}
+    assert {tuple(numbers(message)) for message in hosts.known.values()} == {(0, 1, 2, 3)}
+    assert (kept.others, kept.unheard) == ((), ())
+
+
+def test_who_keeps_another_list_or_is_not_heard_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hosts = Hosts(monkeypatch, {"alpha": 1, "bravo": 1}, deaf=("bravo",))
+    kept = hosts.add()
+    assert (kept.others, kept.unheard) == (("bravo",), ("charlie",))
+    monkeypatch.setattr(running_launches, "find_launch", lambda _: hosts.launch)
+    with pytest.raises(MissionError, match="obstacle: not taken by bravo"):
+        obstacle_remove([0])
+    assert "nothing is heard from charlie, which may keep another" in capsys.readouterr().err
+
+
+def test_what_the_own_launch_does_not_take_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    hosts = Hosts(monkeypatch, {"alpha": 1, "bravo": 1, "charlie": 1}, deaf=("alpha",))
+    with pytest.raises(StartError, match="the launch did not take the list"):
+        hosts.add()
+
+
+def test_a_host_whose_version_nobody_can_have_come_to_stops_no_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    hosts = Hosts(monkeypatch, {"alpha": 1, "bravo": 2**62, "charlie": 1})
+    kept = hosts.add()
+    assert (kept.others, kept.listed.version) == (("bravo",), 2)
+    assert hosts.known["charlie"].version == 2
