@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import signal
@@ -18,7 +19,7 @@ from swarmctl.core.recorded.records import TRUTH_COLUMNS
 from swarmctl.ops.cli import main
 from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, read_parquet
 from tests.benches.free_ports import free_ports
-from tests.benches.launches import Launched
+from tests.benches.launches import READY_S, Launched
 from tests.process.test_bus import until
 from tests.process.test_readme import shown
 
@@ -174,3 +175,33 @@ def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: 
         assert alpha.end() == 0, alpha.text()
         assert alpha.summary()["violations"] == []
         assert least_separation_m(alpha.run_dir, bravo.run_dir) >= 0.85
+
+
+def test_a_station_ends_without_who_was_excluded_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_swarm(tmp_path, duration_s=6.0)
+    make_keys(path, monkeypatch)
+    with started(path) as start:
+        alpha, station = start("alpha"), start("station")
+        assert until(lambda: "waits for agent-1 to stand by" in alpha.text(), READY_S), alpha.text()
+        excluded = station.verb("exclude", "--peer", "1")
+        assert excluded.returncode == 0, excluded.stderr
+        assert alpha.end() == 0, alpha.text()
+        assert station.end() == 0, station.text()
+        assert "completed without agent-1" in station.text()
+        assert (station.summary()["violations"], station.summary()["without"]) == ([], [1])
+
+
+def test_a_station_names_an_agent_that_died_on_the_ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its vehicle is taken over by a process that says only that an operator has stopped it."""
+    path = write_swarm(tmp_path)
+    make_keys(path, monkeypatch)
+    with started(path) as start:
+        bravo, station = start("bravo"), start("station")
+        bravo.until_phase("STANDBY", 1)
+        assert until(lambda: "agent-1  STANDBY" in station.text(), READY_S), station.text()
+        os.kill(bravo.pid_of("--id", "1"), signal.SIGKILL)
+        assert bravo.end() == 4, bravo.text()
+        station.process.send_signal(signal.SIGINT)
+        assert station.end() == 130, station.text()
+        assert station.summary()["violations"][0] == "agent-1 died before its vehicle was down"
+        assert "had not ended: agent-0 (none)" in station.text()

@@ -27,6 +27,7 @@ MAX_VERSION_STEP = (
 MAX_REASON = 500  # longest reason of a refusal, or text about what is obeyed
 Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+Agents = Annotated[tuple[Count, ...], msgspec.Meta(max_length=256)]
 
 
 class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -64,6 +65,7 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     alert_age_s: float  # since it began
     uses_commitments: bool  # it flies committed trajectories only, see `control.commit`
     utc_us: Count  # time of sending, by the agent's clock
+    without: Agents = ()  # peers that it does not wait for: it has never heard them, and somebody vouches for their end
 
 
 class CommandMessage(msgspec.Struct, frozen=True):
