@@ -8,7 +8,7 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -91,13 +91,13 @@ def make_keys(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def started(path: Path) -> Iterator[Callable[[str], Launched]]:
+def started(path: Path, agents: Mapping[str, str] = AGENTS) -> Iterator[Callable[[str], Launched]]:
     """Yield what starts alpha, bravo or the station; their folders are gone afterwards."""
     running: list[tuple[Launched, Path]] = []
 
     def start(name: str) -> Launched:
         temp = Path(tempfile.mkdtemp(prefix="sw"))
-        words = as_shown("station", path) if name == "station" else as_shown("host", path, AGENTS[name])
+        words = as_shown("station", path) if name == "station" else as_shown("host", path, agents[name])
         kind = StartedStation if name == "station" else StartedHost
         options = ("--no-view",) if name == "station" else ()
         launched = kind(path.parent / name, temp, *words[2:], *options)
@@ -205,3 +205,20 @@ def test_a_station_names_an_agent_that_died_on_the_ground(tmp_path: Path, monkey
         assert station.end() == 130, station.text()
         assert station.summary()["violations"][0] == "agent-1 died before its vehicle was down"
         assert "had not ended: agent-0 (none)" in station.text()
+
+
+def test_a_station_that_comes_late_hears_who_has_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing else is heard of it any more, and its host is not over yet."""
+    path = write_swarm(tmp_path, duration_s=40.0)
+    of_one_host, _, _ = path.read_text().replace("agents = [0]", "agents = [0, 1]").rpartition("[[hosts]]")
+    path.write_text(of_one_host)
+    make_keys(path, monkeypatch)
+    with started(path, {"alpha": "0,1"}) as start:
+        alpha = start("alpha")
+        alpha.until_phase("TRACK", 2)
+        os.kill(alpha.pid_of("--id", "1"), signal.SIGKILL)
+        assert until(lambda: "the vehicle of agent-1 is on the ground" in alpha.text(), READY_S), alpha.text()
+        station = start("station")
+        assert alpha.end() == 4, alpha.text()
+        assert station.end() == 4, station.text()
+        assert "agent-1 died before its vehicle was down" in station.summary()["violations"]
