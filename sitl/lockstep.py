@@ -26,12 +26,11 @@ from swarmctl.bus import topics
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.local.links import Impairments
-from swarmctl.bus.messages.json_messages import CommandMessage, encode_message, first_list
+from swarmctl.bus.messages.json_messages import CommandMessage, EndedMessage, encode_message, first_list
 from swarmctl.bus.relay import RelayingBus
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import EXCLUDE
 from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows
 from swarmctl.core.types import Plan
 from swarmctl.kernels import why_not_repeatable
@@ -155,13 +154,12 @@ class Lockstep:
         log = self.logs[index]
         others = [i for i in range(self.config.swarm.agents) if i != index]
         bus = RelayingBus(self.hub.connect(agent_name(index), dict.fromkeys(topics.FOR_AGENTS)), others)
-        boot_id = self.config.seed * 1000 + index + self._starts[index] * 1_000_000
         config = self._own.get(index, self.config)
         key = self._keys[index]
         return make_agent(
             config,
             index,
-            boot_id,
+            self._boot_id(index),
             self.links[index][0],
             bus=bus,
             clock=log.clock,
@@ -170,6 +168,9 @@ class Lockstep:
             stopwatch_ns=time.perf_counter_ns,
             signing=None if key is None else SigningChannel(key, AGENT_LINK, log.clock.utc_us),
         )
+
+    def _boot_id(self, index: int) -> int:
+        return self.config.seed * 1000 + index + self._starts[index] * 1_000_000
 
     def step(self) -> None:
         """Tick every agent once, then step the physics to the next tick."""
@@ -195,7 +196,8 @@ class Lockstep:
         """End an agent's process: no more setpoints, its bus session closes, and the others are told as by a launch."""
         self.agents[index] = None
         self.hub.detach(agent_name(index))
-        self._say(topics.ENDED, EXCLUDE, peer=index)
+        ended = EndedMessage(agent=index, boot_id=self._boot_id(index), is_down=False)
+        self._operator.publish(topics.ENDED, encode_message(ended))
 
     def recover(self, index: int) -> None:
         """End an agent's process and start another that only lands its vehicle, as a launch does with a frozen one."""
@@ -211,11 +213,8 @@ class Lockstep:
 
     def command(self, verb: str, agent: int = -1, **arguments: float) -> None:
         """Send an operator's order, as a verb does."""
-        self._say(topics.COMMAND, verb, agent, **arguments)
-
-    def _say(self, topic: topics.Topic, verb: str, agent: int = -1, **arguments: float) -> None:
         message = CommandMessage(verb, agent, self.clock.utc_us(), arguments)
-        self._operator.publish(topic, encode_message(message))
+        self._operator.publish(topics.COMMAND, encode_message(message))
 
     def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Replace the obstacle list by obstacles that are at their centres now, as an operator's verb does."""

@@ -33,8 +33,10 @@ from swarmctl.bus.bus import agent_name
 from swarmctl.bus.messages.commitment_messages import decode_trajectory_message
 from swarmctl.bus.messages.json_messages import (
     AnswerMessage,
+    EndedMessage,
     decode_answer,
     decode_command,
+    decode_ended,
     decode_obstacles,
     decode_status,
     encode_message,
@@ -114,6 +116,7 @@ def flown_bytes(folder: Path) -> dict[str, list[bytes]]:
     sent["mavlink"] = [frame for i in range(AGENTS) for frame in _logged(folder / f"agent-{i}.tlog")]
     answer = AnswerMessage(agent=0, boot_id=1, verb="hold", number=1, accepted=True, reason="", utc_us=1)
     sent["answer"] = [encode_message(answer)]
+    sent["ended"] = [encode_message(EndedMessage(agent=0, boot_id=1, is_down=True))]
     return {name: payloads for name, payloads in sent.items() if payloads}
 
 
@@ -196,6 +199,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "status": Target(seeds["status"], decode_status),
         "command": Target(seeds["command"], decode_command),
         "answer": Target(seeds["answer"], decode_answer),
+        "ended": Target(seeds["ended"], decode_ended),
         "obstacles": Target(seeds["obstacles"], decode_obstacles),
         "sealed": Target(sealed, lambda data: verifier.open("agent-0", "path", data, 1_800_000_000_000_000)),
         "tick row": Target(seeds["tick"], unpack_tick),

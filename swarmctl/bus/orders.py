@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from swarmctl.bus.messages.json_messages import CommandMessage, decode_command, encode_message
 from swarmctl.bus.refusals import FUTURE_ORDER, MALFORMED, REPLAYED, SEQUENCE, STALE_ORDER, SUPERSEDED_ORDER, Refusals
-from swarmctl.bus.topics import COMMAND, Topic
+from swarmctl.bus.topics import COMMAND
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, UNNUMBERED, Answer, Order
 
 VALID_US = 2_000_000  # from its stamp on
@@ -42,11 +42,10 @@ class Orders:
     Args:
         agent: own index.
         refusals: counts orders that are not obeyed.
-        topic: on which they arrive.
     """
 
-    def __init__(self, agent: int, refusals: Refusals, topic: Topic = COMMAND) -> None:
-        self._agent, self._refusals, self._topic = agent, refusals, topic.name
+    def __init__(self, agent: int, refusals: Refusals) -> None:
+        self._agent, self._refusals = agent, refusals
         self._newest: CommandMessage | None = None  # newest one obeyed
         self._numbered: dict[int, Order] = {}  # those taken, by number
         self._answers: dict[int, Answer] = {}  # by number
@@ -63,7 +62,7 @@ class Orders:
             self._keep_misdated(sender, message.number, reason, utc_us)
             return None
         if reason or message is None:
-            self._refusals.add(sender, self._topic, reason, utc_us)
+            self._refusals.add(sender, COMMAND.name, reason, utc_us)
             if message is not None:
                 self._answer_again(message.order, reason)
             return None
@@ -108,7 +107,7 @@ class Orders:
     def _refuse_misdated(self, number: int, reason: str, utc_us: int) -> None:
         misdated = self._misdated.pop(number)
         for _ in range(misdated.count):
-            self._refusals.add(misdated.sender, self._topic, reason, utc_us)
+            self._refusals.add(misdated.sender, COMMAND.name, reason, utc_us)
 
     def _answer_again(self, order: Order, reason: str) -> None:
         if order.number == UNNUMBERED:

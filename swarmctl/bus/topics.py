@@ -26,7 +26,7 @@ FAR_PATH = Topic(name="far_path", ring=4, max_bytes=4096, reliable=False)  # the
 STATUS = Topic(name="status", ring=4, max_bytes=20_480, reliable=False)
 TICK = Topic(name="tick", ring=256, max_bytes=4096, reliable=False)
 COMMAND = Topic(name="command", ring=64, max_bytes=1024, reliable=True)
-ENDED = Topic(name="ended", ring=64, max_bytes=1024, reliable=True)  # a computer says that an agent of it has ended
+ENDED = Topic(name="ended", ring=64, max_bytes=1024, reliable=True)  # of which of its agents a computer says so
 ANSWER = Topic(name="answer", ring=16, max_bytes=4096, reliable=True)
 OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
 MISSION = Topic(name="mission", ring=4, max_bytes=MAX_MISSION_BYTES, reliable=True)

@@ -9,12 +9,19 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import msgspec
+
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
-from swarmctl.bus.messages.json_messages import decode_command, encode_message
+from swarmctl.bus.messages.json_messages import (
+    EndedMessage,
+    StatusMessage,
+    decode_command,
+    decode_ended,
+    encode_message,
+)
 from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, OPERATOR, STATUS
 from swarmctl.config import load
-from swarmctl.core.operator_verbs import EXCLUDE, PEER
 from swarmctl.core.types import Phase
 from swarmctl.ops.processes import ROUTER, Child, Command, RunContext, kill_all
 from swarmctl.ops.supervision.launch_result import LaunchResult
@@ -45,8 +52,8 @@ def ends(code: int, after_s: float = 0.3) -> str:
     return LANDS_ON_SIGTERM + f"time.sleep({after_s}); print('because'); sys.exit({code})"
 
 
-def status_of(agent: int, phase: Phase, utc_us: int, held: bool = False) -> bytes:
-    return encode_message(builders.status_message(agent=agent, phase=phase, utc_us=utc_us, held=held))
+def status_of(agent: int, phase: Phase, utc_us: int, held: bool = False) -> StatusMessage:
+    return builders.status_message(agent=agent, phase=phase, utc_us=utc_us, held=held)
 
 
 class ScriptedServices(Services):
@@ -67,9 +74,6 @@ class ScriptedServices(Services):
         self.hub = LocalHub(lambda: time.monotonic_ns() // 1000)
         self.bus = self.hub.connect(OPERATOR)
         self.agents = [self.hub.connect(agent_name(i)) for i in range(len(agents))]
-        self.elsewhere = self.hub.connect(agent_name(len(agents)))  # an agent of another computer
-        self.elsewhere_behind_us: int | None = None  # by how much its clock is behind ours; None: there is none
-        self.end_stamps_us: list[int] = []  # by how much each message of an end was stamped before we heard it
         self.directory = directory
         self.lands = ends(130, 0.5)  # what recovers a vehicle
         self.router = FLIES_LONG  # what is started in place of a router that has ended
@@ -78,7 +82,8 @@ class ScriptedServices(Services):
         self.interrupts = 0
         self.silent: set[int] = set()
         self.orders: list[str] = []
-        self.vouched: set[int] = set()  # agents whose end the others were told
+        self.boot_ids = [1 for _ in agents]  # of the processes that are heard
+        self.ended: list[EndedMessage] = []  # as the first agent has received them
         self.heard: list[tuple[int, bytes]] = []  # orders as the first agent has received them, and when
         self.stamped_us: list[tuple[int, int]] = []  # of each order, by how much it was stamped before we heard it
         self.behind_us = 0  # by how much the agents' clock is behind ours
@@ -100,6 +105,7 @@ class ScriptedServices(Services):
 
     def recover(self, agent: int) -> Child:
         self.recovered.append(agent)
+        self.boot_ids[agent] += 1
         return Child(Command(agent_name(agent), (sys.executable, "-ESc", self.lands)), self.directory)
 
     def join_as_operator(self) -> None:
@@ -122,17 +128,13 @@ class ScriptedServices(Services):
             orders = [order for order in map(decode_command, received) if order]
             self.orders += [order.verb for order in orders]
             self.stamped_us += [(order.utc_us, now_us - order.utc_us) for order in orders]
-            ended = [order for _, payload in bus.receive(ENDED) if (order := decode_command(payload))]
-            self.end_stamps_us += [now_us - order.utc_us for order in ended if i == 0]
-            self.vouched |= {int(order.arguments[PEER]) for order in ended if order.verb == EXCLUDE}
+            self.ended += [end for _, payload in bus.receive(ENDED) if i == 0 and (end := decode_ended(payload))]
             obeys = self.obeys and i not in self.silent and i not in self.recovered  # what recovers a vehicle lands it
             if any(order.verb == "land" for order in orders) and obeys:
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:
-                bus.publish(STATUS, status_of(i, self.phases.get(i, self.phase), now_us - self.behind_us, self.held))
-        if self.elsewhere_behind_us is not None:
-            elsewhere_us = time.time_ns() // 1000 - self.elsewhere_behind_us
-            self.elsewhere.publish(STATUS, status_of(len(self.agents), self.phase, elsewhere_us))
+                status = status_of(i, self.phases.get(i, self.phase), now_us - self.behind_us, self.held)
+                bus.publish(STATUS, encode_message(msgspec.structs.replace(status, boot_id=self.boot_ids[i])))
         if time.monotonic() - self.began_s > 0.3:
             act, self.act = self.act, lambda: None
             act()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from swarmctl.core.recorded.records import TRUTH_COLUMNS
 from swarmctl.ops.cli import main
 from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, read_parquet
 from tests.benches.free_ports import free_ports
-from tests.benches.launches import Launched
+from tests.benches.launches import READY_S, Launched
 from tests.process.test_bus import until
 from tests.process.test_readme import shown
 
@@ -90,13 +91,13 @@ def make_keys(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def started(path: Path) -> Iterator[Callable[[str], Launched]]:
+def started(path: Path, agents: Mapping[str, str] = AGENTS) -> Iterator[Callable[[str], Launched]]:
     """Yield what starts alpha, bravo or the station; their folders are gone afterwards."""
     running: list[tuple[Launched, Path]] = []
 
     def start(name: str) -> Launched:
         temp = Path(tempfile.mkdtemp(prefix="sw"))
-        words = as_shown("station", path) if name == "station" else as_shown("host", path, AGENTS[name])
+        words = as_shown("station", path) if name == "station" else as_shown("host", path, agents[name])
         kind = StartedStation if name == "station" else StartedHost
         options = ("--no-view",) if name == "station" else ()
         launched = kind(path.parent / name, temp, *words[2:], *options)
@@ -174,3 +175,50 @@ def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: 
         assert alpha.end() == 0, alpha.text()
         assert alpha.summary()["violations"] == []
         assert least_separation_m(alpha.run_dir, bravo.run_dir) >= 0.85
+
+
+def test_a_station_ends_without_who_was_excluded_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_swarm(tmp_path, duration_s=6.0)
+    make_keys(path, monkeypatch)
+    with started(path) as start:
+        alpha, station = start("alpha"), start("station")
+        assert until(lambda: "waits for agent-1 to stand by" in alpha.text(), READY_S), alpha.text()
+        excluded = station.verb("exclude", "--peer", "1")
+        assert excluded.returncode == 0, excluded.stderr
+        assert alpha.end() == 0, alpha.text()
+        assert station.end() == 0, station.text()
+        assert "completed without agent-1" in station.text()
+        assert (station.summary()["violations"], station.summary()["without"]) == ([], [1])
+
+
+def test_a_station_names_an_agent_that_died_on_the_ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its vehicle is taken over by a process that says only that an operator has stopped it."""
+    path = write_swarm(tmp_path)
+    make_keys(path, monkeypatch)
+    with started(path) as start:
+        bravo, station = start("bravo"), start("station")
+        bravo.until_phase("STANDBY", 1)
+        assert until(lambda: "agent-1  STANDBY" in station.text(), READY_S), station.text()
+        os.kill(bravo.pid_of("--id", "1"), signal.SIGKILL)
+        assert bravo.end() == 4, bravo.text()
+        station.process.send_signal(signal.SIGINT)
+        assert station.end() == 130, station.text()
+        assert station.summary()["violations"][0] == "agent-1 died before its vehicle was down"
+        assert "had not ended: agent-0 (none)" in station.text()
+
+
+def test_a_station_that_comes_late_hears_who_has_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing else is heard of it any more, and its host is not over yet."""
+    path = write_swarm(tmp_path, duration_s=40.0)
+    of_one_host, _, _ = path.read_text().replace("agents = [0]", "agents = [0, 1]").rpartition("[[hosts]]")
+    path.write_text(of_one_host)
+    make_keys(path, monkeypatch)
+    with started(path, {"alpha": "0,1"}) as start:
+        alpha = start("alpha")
+        alpha.until_phase("TRACK", 2)
+        os.kill(alpha.pid_of("--id", "1"), signal.SIGKILL)
+        assert until(lambda: "the vehicle of agent-1 is on the ground" in alpha.text(), READY_S), alpha.text()
+        station = start("station")
+        assert alpha.end() == 4, alpha.text()
+        assert station.end() == 4, station.text()
+        assert "agent-1 died before its vehicle was down" in station.summary()["violations"]

@@ -21,6 +21,7 @@ from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import PeerPaths, peer_verifiers
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage
+from swarmctl.bus.vouched_ends import VouchedEnds
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.collision.separation import (
     KeepOuts,
@@ -33,7 +34,7 @@ from swarmctl.control.collision.separation import (
 from swarmctl.control.estimation.constant_velocity import CREEP_M_S
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import EXCLUDE, PEER, Answer, Order
+from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase
@@ -59,9 +60,9 @@ class WorldModel:
         bus: source of messages, drained by `listen`.
         rate_hz: tick rate of every agent.
         vouchers: agents of which each sender may say that they have ended.
-        note: receives the events `refused` (see `Refusals`), `obstacles_changed` with the list as it was received, and
-            `unresponsive`: a peer on the bus has published no accepted path for `lost_after_s`; also when that ends,
-            with its duration.
+        note: receives the events `refused` (see `Refusals`), `obstacles_changed` with the list as it was received,
+            `peer_ended` with the process that has, and `unresponsive`: a peer on the bus has published no accepted
+            path for `lost_after_s`; also when that ends, with its duration.
     """
 
     def __init__(
@@ -82,11 +83,10 @@ class WorldModel:
         self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence, clocks=self.clocks)
         self._verifiers = peer_verifiers(peers, topics.STATUS, rate_hz, self.refusals, presence=self.presence)
         self._orders = Orders(agent, self.refusals)
-        self._ends, self._vouchers = Orders(agent, self.refusals, topics.ENDED), vouchers
+        self._ends = VouchedEnds(vouchers)
         self._unresponsive_since_us: dict[int, int] = {}
         self._status: dict[int, StatusMessage] = {}
         self._status_us: dict[int, int] = {}  # UTC of the newest one's arrival
-        self._vouched: dict[int, int | None] = {}  # boot id of each agent that somebody says has ended
         self._listed: ObstaclesMessage | None = None  # the newest list of obstacles
         self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by number
 
@@ -100,9 +100,9 @@ class WorldModel:
         for sender, payload in self._bus.receive(topics.OBSTACLES):
             self._take_obstacles(sender, payload, utc_us)
         orders = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
-        orders += [self._end_of_a_peer(*received, utc_us) for received in self._bus.receive(topics.ENDED)]
+        for sender, payload in self._bus.receive(topics.ENDED):
+            self._take_end(sender, payload, utc_us)
         self._orders.refuse_misdated(utc_us)
-        self._ends.refuse_misdated(utc_us)
         for sender, topic, reason in self._bus.refused():
             self.refusals.add(sender, topic, reason, utc_us)
         self.refusals.report(utc_us)
@@ -114,16 +114,13 @@ class WorldModel:
         far, near = self._bus.receive(topics.FAR_PATH), self._bus.receive(topics.PATH)
         return sorted(far + near, key=lambda item: stamp_us(item[1])) if far else near
 
-    def _end_of_a_peer(self, sender: str, payload: bytes, utc_us: int) -> Order | None:
-        """Return the order to go on without a peer, from who runs its process and has seen it end; or None."""
-        order = self._ends.take(sender, payload, utc_us)
-        if order is None:
-            return None
-        if order.verb == EXCLUDE and order.arguments[PEER] in self._vouchers.get(sender, ()):
-            self.exclude(int(order.arguments[PEER]))  # at once: no `life_sign` speaks against who runs the process
-            return order
-        self.refusals.add(sender, topics.ENDED.name, IDENTITY, utc_us)
-        return None
+    def _take_end(self, sender: str, payload: bytes, utc_us: int) -> None:
+        """Believe who runs a peer's process, and has seen it end; no `life_sign` speaks against that."""
+        ended, refusal = self._ends.take(sender, payload)
+        if refusal:
+            self.refusals.add(sender, topics.ENDED.name, refusal, utc_us)
+        if ended is not None:
+            self._note("peer_ended", agent=ended.agent, boot_id=ended.boot_id, is_down=ended.is_down)
 
     def answer(self, order: Order, refusal: str, comes_to: str = "") -> None:
         """Keep the agent's answer to an order: accepted, and what it comes to, or why it is refused."""
@@ -310,7 +307,7 @@ class WorldModel:
 
     def exclude(self, agent: int) -> None:
         """Believe that the process of a peer has ended; another process under its number takes part again."""
-        self._vouched[agent] = self._boot_id(agent)
+        self._ends.vouch(agent, self._boot_id(agent))
 
     def life_sign(self, agent: int, utc_us: int) -> str:
         """Return what speaks against an operator's word that a peer has ended: it was just heard; or ""."""
@@ -325,13 +322,12 @@ class WorldModel:
         Somebody vouches for the end of its process, or it was heard done, and sends nothing to its vehicle any more. A
         missing liveliness token is none: the peer may be cut off.
         """
-        vouched = agent in self._vouched and self._vouched[agent] == self._boot_id(agent)
-        return vouched or self._is_in(agent, Phase.DONE)
+        return self._ends.has_ended(agent, self._boot_id(agent)) or self._is_in(agent, Phase.DONE)
 
     @property
     def excused(self) -> frozenset[int]:
         """Return the peers that have never been heard, and that nobody has to wait for: somebody vouches for it."""
-        return frozenset(self._vouched.keys() - self._status.keys())
+        return frozenset(self._ends.agents - self._status.keys())
 
     def _boot_id(self, agent: int) -> int | None:
         status = self._status.get(agent)

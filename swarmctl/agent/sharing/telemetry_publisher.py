@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from swarmctl.agent.ports import TickSink
 from swarmctl.agent.tick_results import ControlOutput, PlanningResult
@@ -104,15 +104,15 @@ class TelemetryPublisher:
             timing=timing,
         )
 
-    def publish(self, record: TickRecord, mission: MissionState) -> None:
-        """Hand a record to the sink and the bus, and a status where one is due."""
+    def publish(self, record: TickRecord, mission: MissionState, without: Collection[int]) -> None:
+        """Hand a record to the sink and the bus, and a status where one is due, with the peers not waited for."""
         self._recent_ms.append(record.timing.tick_ms)
         row = tick_row(record)
         self._sink.tick(row, record.flown)
         self._bus.publish(topics.TICK, pack_tick(row, record.flown))
         if record.t_us - self._status_us >= _STATUS_EVERY_US:
             self._status_us = record.t_us
-            self._bus.publish(topics.STATUS, encode_message(self._status(record, mission)))
+            self._bus.publish(topics.STATUS, encode_message(self._status(record, mission, without)))
 
     def answer(self, answer: Answer) -> None:
         """Answer an operator's order."""
@@ -142,7 +142,7 @@ class TelemetryPublisher:
         ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
         return peers, obstacles, max(ages_ms, default=math.nan)
 
-    def _status(self, record: TickRecord, mission: MissionState) -> StatusMessage:
+    def _status(self, record: TickRecord, mission: MissionState, without: Collection[int]) -> StatusMessage:
         state, reference, error_m = record.state, record.reference, math.nan
         health, received_us, alert = self._autopilot.health, self._autopilot.received_us, self.active_alert
         if state is not None and reference is not None:
@@ -181,6 +181,7 @@ class TelemetryPublisher:
             alert_age_s=-1.0 if alert is None else (record.t_us - alert.since_us) * 1e-6,
             uses_commitments=self._uses_commitments,
             utc_us=record.utc_us,
+            without=tuple(sorted(without)),
         )
 
 

@@ -1,4 +1,4 @@
-"""Messages of the bus that are JSON: an agent's status, an operator's order, its answers, the list of obstacles.
+"""Messages of the bus that are JSON: an agent's status and end, an operator's order, its answers, the obstacles.
 
 Decoders check bounds and return None for anything that does not fit; they never raise. Text of others is made
 printable here, so that no log, table or alert holds a control character of theirs.
@@ -28,6 +28,7 @@ MAX_ANCESTORS = 64  # lists before this one by which it is known whether its ope
 MAX_REASON = 500  # longest reason of a refusal, or text about what is obeyed
 Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+Agents = Annotated[tuple[Count, ...], msgspec.Meta(max_length=256)]
 
 
 class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -65,6 +66,7 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     alert_age_s: float  # since it began
     uses_commitments: bool  # it flies committed trajectories only, see `control.commit`
     utc_us: Count  # time of sending, by the agent's clock
+    without: Agents = ()  # peers that it does not wait for: it has never heard them, and somebody vouches for their end
 
 
 class CommandMessage(msgspec.Struct, frozen=True):
@@ -97,6 +99,17 @@ class AnswerMessage(msgspec.Struct, frozen=True, kw_only=True):
     def answer(self) -> Answer:
         """The answer itself, without sender and time."""
         return Answer(self.verb, self.number, self.accepted, self.reason)
+
+
+class EndedMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """Holds that one process of an agent has ended, as the supervisor says that has seen it end.
+
+    It names the process, so it stays true however late it arrives, and says nothing of one that follows.
+    """
+
+    agent: Count
+    boot_id: Count | None  # None: its supervisor had heard nothing of it
+    is_down: bool  # its vehicle is on the ground and disarmed
 
 
 class MissionMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -217,6 +230,11 @@ def decode_answer(payload: bytes) -> AnswerMessage | None:
     return _printable(_decode(payload, _ANSWER_DECODER), "verb", "reason")
 
 
+def decode_ended(payload: bytes) -> EndedMessage | None:
+    """Decode the end of an agent's process; None if it is malformed or out of bounds."""
+    return _decode(payload, _ENDED_DECODER)
+
+
 def decode_mission(payload: bytes) -> MissionMessage | None:
     """Decode a mission, whose text is not looked at; None if it is malformed."""
     return _decode(payload, _MISSION_DECODER)
@@ -246,6 +264,7 @@ def _obstacle(kind: type, item: Any) -> Obstacle:
 _STATUS_DECODER = msgspec.json.Decoder(StatusMessage)
 _COMMAND_DECODER = msgspec.json.Decoder(CommandMessage)
 _ANSWER_DECODER = msgspec.json.Decoder(AnswerMessage)
+_ENDED_DECODER = msgspec.json.Decoder(EndedMessage)
 _MISSION_DECODER = msgspec.json.Decoder(MissionMessage)
 _OBSTACLES_DECODER = msgspec.json.Decoder(ObstaclesMessage, dec_hook=_obstacle)
 

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import ObstaclesMessage, StatusMessage
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.topics import TICK
+from swarmctl.bus.vouched_ends import VouchedEnds
 from swarmctl.config import Config, own_identity
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.obstacle import Obstacle
@@ -67,6 +69,7 @@ def run_station(config: Config, options: LaunchOptions) -> int:
                 configured=config.obstacles,
                 list_setters=list_setters(services.context.identity),
                 clock=services.clock,
+                vouchers={host.name: frozenset(host.agents) for host in config.hosts},
             )
             told = partial(tell, services.log, services.display)
             viewer = ViewerWatch(services.children.get(VIEWER), told, services.announce)
@@ -82,7 +85,7 @@ def run_station(config: Config, options: LaunchOptions) -> int:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
     result = LaunchResult(
         problems=watch.problems,
-        interrupted=bool(stop.count),
+        interrupted=bool(stop.count) and not watch.is_over,
         landed_by_operator=watch.was_stopped,
         has_armed=True,
     )
@@ -97,13 +100,16 @@ class SwarmWatch:
         agents: size of the swarm.
         directory: run folder for what they report.
         display: shows them.
-        note: is told of refused messages, see `Refusals`, of lists of obstacles, and of senders' clocks.
+        note: is told of refused messages, see `Refusals`, of lists of obstacles, of senders' clocks, and of agents that
+            were not waited for.
+        vouchers: agents of which each sender may say that they have ended.
         configured, list_setters, clock: see `ObstacleKeeper`.
         clock_s: monotonic time [s].
 
     Attributes:
         problems: what went wrong, in words.
         was_stopped: whether an operator has ended the mission of an agent.
+        is_over: whether every agent that is waited for has ended, or is lost.
     """
 
     def __init__(
@@ -115,6 +121,7 @@ class SwarmWatch:
         note: Callable[..., None],
         clock_s: Callable[[], float] = time.monotonic,
         *,
+        vouchers: Mapping[str, Set[int]],
         configured: Sequence[Obstacle] = (),
         list_setters: Collection[str] = (),
         clock: WallClock | None = None,
@@ -125,65 +132,71 @@ class SwarmWatch:
             bus, configured, clock or WallClock(), trusted=list_setters, refuse=self._report.refuse
         )
         self._recorded_list: ObstaclesMessage | None = None
-        self._views = [AgentView(agent=agent) for agent in range(agents)]
+        self._views = [AgentView(agent=agent, received_s=clock_s()) for agent in range(agents)]
         self._numbers = {agent_name(agent): agent for agent in range(agents)}
         self._recorders = {name: Recorder(directory, agent) for name, agent in self._numbers.items()}
         self._clocks = SenderClocks(note)
         self._flying: set[int] = set()  # agents that were heard between the beginning and the end of a flight
-        self._ended_in_flight: dict[int, str] = {}  # agents whose process has, in words
+        self._without: set[int] = set()  # agents of which another one has said that it goes on without them
+        self._ends = VouchedEnds(vouchers)
+        self._died: dict[int, str] = {}  # agents whose process ended before the vehicle was down, in words
         self._stepped_s = clock_s()
-        self._is_over = False
         self.problems: list[str] = []
-        self.was_stopped = False
+        self.was_stopped = self.is_over = False
 
     def step(self) -> bool:
-        """Show and record what has arrived; returns whether every agent was done and has ended, or is lost."""
+        """Show and record what has arrived; returns whether it is over."""
         now_s = self._clock_s()
         self._excuse_own_pause(now_s)
         self._record_ticks()
         for status in self._report.statuses():
             if 0 <= status.agent < len(self._views):
-                view = self._views[status.agent]
-                if view.status is not None and _flies(view.status) and status.boot_id != view.status.boot_id:
-                    in_phase = name_of(Phase, view.status.phase)
-                    ended = f"{agent_name(view.agent)} ended in {in_phase}, and another process took its vehicle over"
-                    self._ended_in_flight.setdefault(view.agent, ended)
-                view.status, view.received_s = status, now_s
-                if _flies(status):
-                    self._flying.add(status.agent)
+                self._take_status(self._views[status.agent], status, now_s)
+        for ended in self._report.ends(self._ends):
+            if not ended.is_down:
+                self._died.setdefault(ended.agent, f"{agent_name(ended.agent)} died before its vehicle was down")
         self._keep_obstacles()
         self._report.step()
         self._display.show(self._views)
         lost = self._lost(now_s, RECOVERY_S)  # a host that lives would have landed its vehicle meanwhile
-        self._is_over = all(self._has_ended(view, now_s) or view.agent in lost for view in self._views)
-        if self._is_over:
-            self._conclude(lost)
-        return self._is_over
+        gone = [view.agent in lost or self._has_ended(view, now_s) for view in self._waited_for()]
+        self.is_over = bool(gone) and all(gone)
+        if self.is_over:
+            self._conclude(lost, ())
+        return self.is_over
 
     def close(self) -> None:
-        """Write what is still to be recorded; who is silent in flight and not waited for any longer counts as lost."""
-        if not self._is_over:
-            self.problems += self._lost(self._clock_s(), _SILENT_S).values()
+        """Write what is still to be recorded; before it is over, judge by what is known, and say who has not ended."""
+        if not self.is_over:
+            now_s, waited_for = self._clock_s(), self._waited_for()
+            not_ended = [view for view in waited_for if not (_is_done(view) or self._has_ended(view, now_s))]
+            self.is_over = bool(waited_for) and not not_ended
+            self._conclude(self._lost(now_s, _SILENT_S), not_ended)
         self._clocks.close()
         for recorder in self._recorders.values():
             recorder.close()
+
+    def _take_status(self, view: AgentView, status: StatusMessage, now_s: float) -> None:
+        if view.status is not None and _flies(view.status) and status.boot_id != view.status.boot_id:
+            ended = f"{agent_name(view.agent)} ended in {_last_phase(view)}, and another process took its vehicle over"
+            self._died[view.agent] = ended
+        view.status, view.received_s = status, now_s
+        self._without.update(status.without)
+        if _flies(status):
+            self._flying.add(status.agent)
 
     def _keep_obstacles(self) -> None:
         """Repeat the list of obstacles, record what hosts keep clear of, and say what operators have to know."""
         for adoption in self._obstacles.receive():
             if overruled := adoption_text(adoption.before, adoption.after):
-                self._tell("obstacles_overruled", overruled)
+                self._say("obstacles_overruled", overruled)
         for text in self._obstacles.others():
-            self._tell("obstacles_elsewhere", text)
+            self._say("obstacles_elsewhere", text)
         heard = self._obstacles.heard
         if heard is not None and heard is not self._recorded_list:
             self._recorded_list = heard
             self._note("obstacles", **recorded_list(heard))
         self._obstacles.repeat()
-
-    def _tell(self, event: str, text: str) -> None:
-        self._note(event, text=text)
-        self._display.print_line(text)
 
     def _record_ticks(self) -> None:
         arrived = self._bus.receive(TICK)
@@ -194,36 +207,66 @@ class SwarmWatch:
                 self._recorders[sender].tick(tick[0], None)
                 self._clocks.received(self._numbers[sender], int(tick[0]["t_us"][0]), arrival_us)
 
+    def _waited_for(self) -> list[AgentView]:
+        """Return all but those without whom the others go on, and who have not flown after all."""
+        return [view for view in self._views if view.agent not in self._without - self._flying]
+
     def _has_ended(self, view: AgentView, now_s: float) -> bool:
-        done = view.status is not None and view.status.phase == Phase.DONE
-        return done and now_s - view.received_s > _GONE_S
+        """Return whether an agent was done, or has left its vehicle down as who runs it says, and is gone.
+
+        That may arrive before the last status, which has the outcome.
+        """
+        is_down = self._ends.is_down(view.agent, None if view.status is None else view.status.boot_id)
+        return (_is_done(view) or is_down) and now_s - view.received_s > _GONE_S
 
     def _lost(self, now_s: float, silent_s: float) -> dict[int, str]:
-        """Return which agents were flying and are silent for longer than `silent_s`, in words."""
-        return {
-            view.agent: f"{agent_name(view.agent)} was lost in {name_of(Phase, view.status.phase)}: "
-            f"nothing was heard of it for {now_s - view.received_s:.0f} s"
-            for view in self._views
-            if view.status is not None and view.agent in self._flying and view.status.phase != Phase.DONE
-            if now_s - view.received_s >= silent_s
-        }
+        """Return who is silent for longer than `silent_s` and has not ended, in words; nobody before one has flown."""
+        lost = {}
+        for view in self._waited_for() if self._flying else ():
+            silence_s = now_s - view.received_s
+            if silence_s >= silent_s and not (_is_done(view) or self._has_ended(view, now_s)):
+                verb = "was lost in" if view.agent in self._flying else "was last heard in"
+                known = "was never heard" if view.status is None else f"{verb} {_last_phase(view)}"
+                lost[view.agent] = f"{agent_name(view.agent)} {known}: nothing was heard of it for {silence_s:.0f} s"
+        return lost
 
-    def _conclude(self, lost: Mapping[int, str]) -> None:
-        """Tell the ends of all agents; of one that was taken over in flight that alone: the outcome is not its own."""
-        told = {**self._ended_in_flight, **lost}
+    def _conclude(self, lost: Mapping[int, str], not_ended: Sequence[AgentView]) -> None:
+        """Tell how all have ended; of one that died or was lost that alone: the outcome is not its own."""
+        told = {**self._died, **lost}
         self.problems += told.values()
-        outcomes = {v.agent: v.status.outcome for v in self._views if v.status is not None and v.agent not in told}
-        self.was_stopped = OPERATOR_STOP in outcomes.values()
-        for agent, outcome in outcomes.items():
+        for view in self._waited_for():
+            if view.agent in told or view in not_ended:
+                continue
+            outcome = view.status.outcome if view.status is not None and _is_done(view) else ""
+            self.was_stopped |= outcome == OPERATOR_STOP
             if outcome not in ("completed", OPERATOR_STOP):
-                self.problems.append(f"{agent_name(agent)} failed: {outcome or 'no reason given'}")
+                why = outcome or f"it has ended, and its last phase heard is {_last_phase(view)}"
+                self.problems.append(f"{agent_name(view.agent)} failed: {why}")
+        if without := sorted(self._without - self._flying):
+            names = ", ".join(map(agent_name, without))
+            self._say("flown_without", f"the others went on without {names}", agents=without)
+        if not_ended:
+            names = ", ".join(f"{agent_name(view.agent)} ({_last_phase(view)})" for view in not_ended)
+            self._say("not_ended", f"had not ended: {names}", agents=[view.agent for view in not_ended])
+
+    def _say(self, event: str, text: str, **fields: Any) -> None:
+        self._note(event, text=text, **fields)
+        self._display.print_line(text)
 
     def _excuse_own_pause(self, now_s: float) -> None:
         """Count no time in which this process itself did not run: nobody was lost in it."""
         paused_s, self._stepped_s = now_s - self._stepped_s, now_s
         if paused_s > _PAUSE_S:
             for view in self._views:
-                view.received_s += paused_s if view.status is not None else 0.0
+                view.received_s += paused_s
+
+
+def _is_done(view: AgentView) -> bool:
+    return view.status is not None and view.status.phase == Phase.DONE
+
+
+def _last_phase(view: AgentView) -> str:
+    return "none" if view.status is None else name_of(Phase, view.status.phase)
 
 
 def _flies(status: StatusMessage) -> bool:

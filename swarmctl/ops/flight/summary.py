@@ -101,7 +101,7 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
     rejected = sum(_section(comms, "rejected").values())
     goals = _goals(_section(summary, "goals"))
     error = f"summed mean tracking error {_m(_section(summary, 'tracking').get('index_m'))}"
-    outcome = f"{summary.get('outcome')}, {goals}{error} ({SUMMED_ERROR})"
+    outcome = f"{summary.get('outcome')}{_without(summary)}, {goals}{error} ({SUMMED_ERROR})"
     if len(violations) == 1:
         outcome += f"; 1 violation: {printable(violations[0])}"
     elif violations:
@@ -126,6 +126,12 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         ),
         f"run folder {directory}",
     )
+
+
+def _without(summary: Mapping[str, Any]) -> str:
+    """Return without whom the others have flown; "" where everybody has."""
+    names = ", ".join(f"agent-{agent}" for agent in summary.get("without") or ())
+    return f" without {names}" if names else ""
 
 
 def _separation(summary: Mapping[str, Any]) -> str:

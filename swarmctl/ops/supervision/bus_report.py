@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.json_messages import StatusMessage, decode_status
+from swarmctl.bus.messages.json_messages import EndedMessage, StatusMessage, decode_status
 from swarmctl.bus.refusals import HARMLESS, IDENTITY, MALFORMED, Refusals
 from swarmctl.bus.silence import SessionWatch
-from swarmctl.bus.topics import STATUS
+from swarmctl.bus.topics import ENDED, STATUS
+from swarmctl.bus.vouched_ends import VouchedEnds
 from swarmctl.ops.supervision.status_table import Display
 from swarmctl.wall_clock import monotonic_us
 
@@ -17,7 +18,7 @@ _REOPENED = "another session of the bus has taken over: the one before may have 
 
 
 class BusReport:
-    """Takes statuses from the bus, and reports what was not one, and what the bus did not deliver.
+    """Takes statuses and ends from the bus, and reports what was neither, and what the bus did not deliver.
 
     Args:
         bus: whose.
@@ -39,6 +40,15 @@ class BusReport:
                 yield status
             else:
                 self.refuse(sender, STATUS.name, MALFORMED if status is None else IDENTITY)
+
+    def ends(self, vouched: VouchedEnds) -> Iterator[EndedMessage]:
+        """Yield the ends of agents' processes that are news, as those say who run them; what others say is refused."""
+        for sender, payload in self._bus.receive(ENDED):
+            ended, refusal = vouched.take(sender, payload)
+            if refusal:
+                self.refuse(sender, ENDED.name, refusal)
+            if ended is not None:
+                yield ended
 
     def step(self) -> None:
         """Report what is new: refused messages, the first of each kind in words, and another session."""

@@ -40,16 +40,20 @@ class Recovery:
         """Return whether the recovery of a vehicle takes longer than allowed."""
         return agent in self._begun_s and time.monotonic() - self._begun_s[agent] > RECOVERY_S
 
+    def leaves_down(self, view: AgentView, code: int) -> bool:
+        """Return whether an agent that ends with this code is known to leave its vehicle on the ground and disarmed."""
+        if code in _DOWN or (code == EXIT_START and not self.is_on(view.agent)):
+            return True
+        return view.status is not None and view.status.phase == Phase.DONE
+
     def begin(self, view: AgentView, code: int) -> Child | None:
         """Register an ended agent; return the process that recovers its vehicle, or None.
 
         Raises:
             StartError, OSError: it can't be started; the vehicle counts as lost.
         """
-        if code in _DOWN or (code == EXIT_START and not self.is_on(view.agent)):
+        if self.leaves_down(view, code):
             self._lost.discard(view.agent)
-            return None
-        if view.status is not None and view.status.phase == Phase.DONE:
             return None
         if self.is_on(view.agent) or view.status is None:
             self._lost |= {view.agent} if view.status is not None else set()

@@ -12,16 +12,18 @@ from collections.abc import Callable
 from functools import partial
 
 from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.messages.json_messages import EndedMessage
 from swarmctl.bus.orders import EVERYBODY, order_messages
-from swarmctl.bus.topics import COMMAND, ENDED, Topic
+from swarmctl.bus.topics import COMMAND
 from swarmctl.config import Config
-from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
+from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.orders.operator import list_setters
 from swarmctl.ops.orders.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.supervision.bus_report import BusReport
+from swarmctl.ops.supervision.ended_processes import EndedProcesses
 from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper, adoption_text
@@ -87,7 +89,7 @@ class FlightSupervisor:
         self._result = LaunchResult()
         self._viewer_watch = ViewerWatch(services.children.get(VIEWER), self._announce, services.announce)
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
-        self._elsewhere: dict[int, AgentView] = {}  # agents of other computers, as they were heard last
+        self._ended = EndedProcesses(self._bus)
         self._report = BusReport(self._bus, services.log.write, display)
         self._obstacles = ObstacleKeeper(
             self._bus,
@@ -162,8 +164,6 @@ class FlightSupervisor:
         for status in self._report.statuses():
             view = next((view for view in self._views if view.agent == status.agent), None)
             if view is None:  # of another computer
-                heard = AgentView(agent=status.agent, status=status, received_s=time.monotonic())
-                self._elsewhere[status.agent] = heard
                 continue
             if view.status is None or view.status.phase != status.phase:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
@@ -208,23 +208,23 @@ class FlightSupervisor:
             if code is None:
                 self._check_responsive(view, child, now_s)
             elif self._is_first(_end_of(child)):
-                self._vouch_for_end(view.agent)
+                self._vouch_for_end(view, code)
                 self._note_end(view, child, code)
                 self._recover(view, code)
 
-    def _vouch_for_end(self, agent: int) -> None:
+    def _vouch_for_end(self, view: AgentView, code: int) -> None:
         """Tell the others, here and elsewhere, that an agent's process has ended, before another takes its place."""
-        others = [view for view in (*self._running(), *self._elsewhere.values()) if view.agent != agent]
-        self._order(Order(EXCLUDE, {PEER: agent}), others, topic=ENDED)
+        boot_id, is_down = None if view.status is None else view.status.boot_id, self._recovery.leaves_down(view, code)
+        self._ended.tell(EndedMessage(agent=view.agent, boot_id=boot_id, is_down=is_down))
 
-    def _order(self, order: Order, views: list[AgentView], agent: int = EVERYBODY, *, topic: Topic = COMMAND) -> None:
+    def _order(self, order: Order, views: list[AgentView], agent: int = EVERYBODY) -> None:
         """Give an order to an agent, or all, stamped by the clocks of these. A repetition is another, obeyed anew."""
         now_s = time.monotonic()
         clocks_us = [
             view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in views if view.status is not None
         ]
         for message in order_messages(numbered(order), agent, self._services.clock.utc_us(), clocks_us):
-            self._bus.publish(topic, message)
+            self._bus.publish(COMMAND, message)
 
     def _recover(self, view: AgentView, code: int) -> None:
         """Start another process that lands a vehicle which is not known to be down."""
@@ -285,6 +285,7 @@ class FlightSupervisor:
         now_s = time.monotonic()
         self._obstacles.repeat()
         self._services.announce_clock()
+        self._ended.repeat()
         if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
             self._land_said_s = now_s
             self._repeat_land_order(now_s - self._land_ordered_s)

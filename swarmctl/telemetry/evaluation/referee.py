@@ -106,7 +106,8 @@ def evaluate(
     run, known = replace(run, ticks=clocked.ticks), clocked.known
     tracks = merge_tracks(known, run.truth, rules.agents)
     clock = _MissionClock(known, tracks)
-    here = _agents_here(run, rules)
+    without = _flown_without(run.events)
+    here = [agent for agent in _agents_here(run, rules) if agent not in without]
     separation, apart = _evaluate_separation(tracks, rules, here, clock)
     obstacles, clear = _evaluate_obstacles(tracks, rules, clock)
     volume, inside = _evaluate_volume(run, tracks, rules, clock)
@@ -124,6 +125,7 @@ def evaluate(
         "violations": violations,
         "version": __version__,
         "agents": rules.agents,
+        "without": [agent for agent in range(rules.agents) if agent in without],
         "duration_s": max(tracked_s.values(), default=0.0),
         "mode": rules.mode,
         "tracking": tracking,
@@ -169,6 +171,12 @@ def _agents_here(run: RunData, rules: Rules) -> Sequence[int]:
     listed = started.get("agents")
     of_swarm = range(rules.agents)
     return [agent for agent in of_swarm if agent in listed] if isinstance(listed, list) and listed else of_swarm
+
+
+def _flown_without(events: Sequence[Mapping[str, Any]]) -> frozenset[int]:
+    """Return the agents without which the others went on before they had flown."""
+    told = (event.get("agents") for event in events if event.get("event") == "flown_without")
+    return frozenset(agent for agents in told if isinstance(agents, list) for agent in agents if isinstance(agent, int))
 
 
 def _evaluate_separation(

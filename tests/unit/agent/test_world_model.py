@@ -18,6 +18,7 @@ from swarmctl.bus.messages.json_messages import (
     MAX_OBSTACLES,
     MAX_VERSION_STEP,
     CommandMessage,
+    EndedMessage,
     decode_obstacles,
     encode_message,
     first_list,
@@ -375,12 +376,42 @@ def test_an_encounter_is_remembered_by_the_obstacles_number_apart_from_peers() -
 )
 def test_only_who_runs_an_agent_says_that_it_has_ended(sender: str, peer: int, believed: bool) -> None:
     bench = Bench()
-    order = CommandMessage(EXCLUDE, -1, bench.clock.utc_us(), {PEER: peer})
-    bench.hub.carry(sender, topics.ENDED, encode_message(order))
+    bench.hub.carry(sender, topics.ENDED, encode_message(EndedMessage(agent=peer, boot_id=1, is_down=False)))
     bench.hub.carry(sender, topics.ENDED, encode_message(CommandMessage("land", -1, bench.clock.utc_us() + 1)))
-    assert bench.tick() == [EXCLUDE] * believed
+    assert bench.tick() == []
     assert bench.world_model.has_ended(1) is believed
-    assert bench.world_model.refusals.by_reason == {"identity": 2 - believed}
+    assert bench.world_model.refusals.by_reason == {"malformed": 1, **({} if believed else {"identity": 1})}
+
+
+def test_an_end_that_is_told_again_says_nothing_of_the_next_process() -> None:
+    bench = Bench()
+
+    def ended_while_heard(process: int, told: int) -> list[bool]:
+        found = []
+        for _ in range(4):
+            bench.seq += 1
+            bench.say_status(phase=int(Phase.STANDBY), boot_id=process)
+            bench.hub.carry("bravo", topics.ENDED, encode_message(EndedMessage(agent=1, boot_id=told, is_down=False)))
+            bench.tick()
+            found.append(bench.world_model.has_ended(1))
+        return found
+
+    assert all(ended_while_heard(1, told=1))
+    for _ in range(150):  # it is silent
+        bench.tick()
+    assert not ended_while_heard(2, told=1)[-1], "another process, which was heard often enough"
+    assert all(ended_while_heard(2, told=2))
+    assert all(ended_while_heard(2, told=1)), "this is old news"
+    assert [row["boot_id"] for row in bench.events if row["event"] == "peer_ended"] == [1, 2]
+
+
+def test_more_ends_than_an_agent_has_processes_are_refused() -> None:
+    bench = Bench()
+    for boot_id in range(70):
+        bench.hub.carry("bravo", topics.ENDED, encode_message(EndedMessage(agent=1, boot_id=boot_id, is_down=False)))
+        bench.tick()
+    assert len([row for row in bench.events if row["event"] == "peer_ended"]) == 64
+    assert bench.world_model.refusals.by_reason == {"sequence": 6}
 
 
 def test_what_an_operator_says_of_a_peer_that_was_just_heard_is_doubted() -> None:

@@ -22,7 +22,7 @@ from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.messages.commitment_messages import encode_trajectory_message
-from swarmctl.bus.messages.json_messages import CommandMessage, encode_message, first_list
+from swarmctl.bus.messages.json_messages import CommandMessage, EndedMessage, encode_message, first_list
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.bus.network.identities import add_identity, make_identities, revoke_identity
 from swarmctl.bus.network.identity_files import STATION
@@ -35,7 +35,6 @@ from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, PATH, RELAY, STATUS, 
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import EXCLUDE, PEER
 from swarmctl.core.trajectory import resting
 from swarmctl.core.types import Phase
 from tests import builders
@@ -312,6 +311,10 @@ def done(scene: Scene) -> bytes:
     return scene.status(Phase.DONE)
 
 
+def ended(agent: int) -> Callable[[Scene], bytes]:
+    return lambda scene: encode_message(EndedMessage(agent=agent, boot_id=BOOT, is_down=False))
+
+
 def trajectory(scene: Scene) -> bytes:
     return scene.trajectory()
 
@@ -327,7 +330,6 @@ class Row:
     by_seal: bool = True  # would be believed without seals
 
 
-AGENT_2_ENDED = says(EXCLUDE, **{PEER: 2.0})
 ROWS = {
     "path without a seal": Row(attack=plain(VICTIM, PATH, path_of(1)), reasons={"unsealed"}),
     "status without a seal": Row(attack=plain(VICTIM, STATUS, done), reasons={"unsealed"}),
@@ -347,14 +349,12 @@ ROWS = {
     "land by a host of agents": Row(attack=sealed_by("charlie", STATION, COMMAND, says("land")), reasons={"forged"}),
     "hold as this host": Row(attack=sealed_by("charlie", "alpha", COMMAND, says("hold")), reasons={"forged"}),
     "obstacles as this host": Row(attack=sealed_by("charlie", "alpha", OBSTACLES, _ball), reasons={"forged"}),
-    "end of an agent, as its host": Row(
-        attack=sealed_by("charlie", "bravo", ENDED, says(EXCLUDE, **{PEER: 1.0})), reasons={"forged"}
-    ),
+    "end of an agent, as its host": Row(attack=sealed_by("charlie", "bravo", ENDED, ended(1)), reasons={"forged"}),
     "end of another's agent": Row(
-        attack=sealed_by("bravo", "bravo", ENDED, AGENT_2_ENDED), reasons={"identity"}, by_seal=False
+        attack=sealed_by("bravo", "bravo", ENDED, ended(2)), reasons={"identity"}, by_seal=False
     ),
     "land among ends of agents": Row(
-        attack=sealed_by("bravo", "bravo", ENDED, says("land")), reasons={"identity"}, by_seal=False
+        attack=sealed_by("bravo", "bravo", ENDED, says("land")), reasons={"malformed"}, by_seal=False
     ),
     "a revoked identity": Row(attack=sealed_by("bravo", VICTIM, PATH, path_of(1), "revoked"), reasons={"forged"}),
     "a revoked operator": Row(attack=sealed_by("bravo", STATION, COMMAND, says("land"), "revoked"), reasons={"forged"}),

@@ -21,9 +21,11 @@ from swarmctl.bus.messages.json_messages import (
     MAX_REASON,
     AnswerMessage,
     CommandMessage,
+    EndedMessage,
     StatusMessage,
     decode_answer,
     decode_command,
+    decode_ended,
     decode_obstacles,
     decode_status,
     encode_message,
@@ -40,7 +42,7 @@ from tests import builders
 
 POINTS = np.array([[1.5, -2.25, -3.0], [1.625, -2.0, -3.5], [1.75, -1.75, -4.0]])
 UTC_US = 1_700_000_000_123_456
-ALL_DECODERS = (decode_path, decode_status, decode_command, decode_answer, decode_obstacles)
+ALL_DECODERS = (decode_path, decode_status, decode_command, decode_answer, decode_ended, decode_obstacles)
 
 STATUS = StatusMessage(
     agent=2,
@@ -200,7 +202,7 @@ def test_a_status_with_one_hostile_field_is_none_or_well_typed(name: str, value:
             assert not isinstance(found, float) or math.isfinite(found)
 
 
-@pytest.mark.parametrize("decode", [decode_status, decode_command, decode_answer, decode_obstacles])
+@pytest.mark.parametrize("decode", [decode_status, decode_command, decode_answer, decode_ended, decode_obstacles])
 @pytest.mark.parametrize(
     "payload",
     [
@@ -221,6 +223,8 @@ def test_messages_survive_encoding() -> None:
     for command in (CommandMessage("rtl", -1, UTC_US), CommandMessage("rtl", 2, UTC_US, {}, 2**62)):
         assert decode_command(encode_message(command)) == command
     assert decode_answer(encode_message(ANSWER)) == ANSWER
+    for ended in (EndedMessage(agent=2, boot_id=boot_id, is_down=True) for boot_id in (9, None)):
+        assert decode_ended(encode_message(ended)) == ended
     obstacle = Obstacle(
         center_ned_m=(9.5, 5.5, -2.3), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0, vel_ned_m_s=(0.0, -0.5, 0.0)
     )

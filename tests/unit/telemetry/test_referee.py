@@ -61,6 +61,13 @@ def test_a_host_judges_the_distances_of_its_own_agents() -> None:
     assert evaluate(run(APART, events=[{**started, "agents": []}]), rules, "failed")["violations"], "as the station's"
 
 
+def test_who_was_flown_without_is_named_and_not_judged() -> None:
+    without = {"event": "flown_without", "agents": [2]}
+    summary = evaluate(run(APART, events=[without]), Rules(agents=3, required_separation_m=0.5), "completed")
+    assert (summary["outcome"], summary["violations"], summary["without"]) == ("completed", [], [2])
+    assert summary["separation"]["min_pair"] == [0, 1]
+
+
 def test_summed_mean_tracking_error_is_the_sum_of_mean_distances() -> None:
     tracking = evaluate(run(APART), Rules(agents=2, required_separation_m=0.5), "completed")["tracking"]
     assert tracking["index_m"] == pytest.approx(1.0 + 2.0)

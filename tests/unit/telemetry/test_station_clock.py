@@ -54,7 +54,7 @@ class Station:
         hub = LocalHub(lambda: round(1e6 * self.now_s))
         senders = [hub.connect(name) for name in names]
         bus = hub.connect("station", {STATUS: names, TICK: names, OBSTACLES: []})
-        watch = SwarmWatch(bus, len(flown), folder, PlainLines(StringIO()), self._note, lambda: self.now_s)
+        watch = SwarmWatch(bus, len(flown), folder, PlainLines(StringIO()), self._note, lambda: self.now_s, vouchers={})
         self._note("started", agents=[])
         rng = np.random.default_rng([1, 0, 0])
         for tick in range(len(flown[0])):

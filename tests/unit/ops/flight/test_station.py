@@ -13,8 +13,14 @@ import pytest
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
-from swarmctl.bus.messages.json_messages import ListedObstacle, decode_obstacles, encode_message, first_list
-from swarmctl.bus.topics import OBSTACLES, STATUS, TICK
+from swarmctl.bus.messages.json_messages import (
+    EndedMessage,
+    ListedObstacle,
+    decode_obstacles,
+    encode_message,
+    first_list,
+)
+from swarmctl.bus.topics import ENDED, OBSTACLES, STATUS, TICK
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
@@ -33,7 +39,12 @@ def test_lists_of_obstacles_are_recorded_once_for_the_referee(tmp_path: Path) ->
     host, stranger = hub.connect("alpha"), hub.connect("bravo")
     with (tmp_path / "said").open("w") as said:
         watch = SwarmWatch(
-            bus, 1, tmp_path, PlainLines(said), lambda event, **row: noted.append({"event": event, **row})
+            bus,
+            1,
+            tmp_path,
+            PlainLines(said),
+            lambda event, **row: noted.append({"event": event, **row}),
+            vouchers={"alpha": {0}},
         )
         lists: list[tuple[int, tuple[Obstacle, ...]]] = [(1, ()), (2, (BALL,)), (2, (BALL,)), (3, ())]
         for version, obstacles in lists:
@@ -41,7 +52,6 @@ def test_lists_of_obstacles_are_recorded_once_for_the_referee(tmp_path: Path) ->
             stranger.publish(OBSTACLES, encode_message(first_list((BALL, BALL), 0, version + 1)))
             assert not watch.step()
             noted[-1].setdefault("utc_us", 1_000_000 * version)  # as the event log does
-        watch.close()
     assert [row["version"] for row in noted] == [1, 2, 3]
     (judged,) = recorded_obstacles((), noted)
     assert (judged.obstacle, judged.since_utc_us, judged.until_utc_us) == (BALL, 2_000_000, 3_000_000)
@@ -59,6 +69,7 @@ def test_a_station_repeats_what_operators_set_and_says_that_a_list_of_its_own_wa
         tmp_path,
         PlainLines(said),
         lambda event, **_: noted.append(event),
+        vouchers={},
         list_setters=("alpha", "station"),
         clock=clock,
     )
@@ -82,12 +93,25 @@ class Watched:
     """A station that watches three agents, on a scripted clock."""
 
     def __init__(self, folder: Path) -> None:
-        self.now_s = 1000.0
+        self.now_s, self.noted = 1000.0, list[tuple[str, Any]]()
         self._hub = LocalHub(lambda: round(1e6 * self.now_s))
         names = [agent_name(agent) for agent in range(3)]
         self._agents = [self._hub.connect(name) for name in names]
-        bus = self._hub.connect("station", {STATUS: names, TICK: names, OBSTACLES: []})
-        self.watch = SwarmWatch(bus, 3, folder, PlainLines(StringIO()), lambda *_, **__: None, lambda: self.now_s)
+        self._hosts = {name: self._hub.connect(name) for name in ("alpha", "bravo")}
+        bus = self._hub.connect("station", {STATUS: names, TICK: names, OBSTACLES: [], ENDED: [*self._hosts]})
+        vouchers = {"alpha": {0, 2}, "bravo": {1}}
+        self.said = StringIO()
+        self.watch = SwarmWatch(
+            bus, 3, folder, PlainLines(self.said), self._note, lambda: self.now_s, vouchers=vouchers
+        )
+
+    def _note(self, event: str, **fields: Any) -> None:
+        self.noted.append((event, fields.get("agents")))
+
+    def end(self, agent: int, *, boot_id: int | None = 1, is_down: bool, host: str = "bravo") -> None:
+        """Have a host say that a process has ended."""
+        ended = EndedMessage(agent=agent, boot_id=boot_id, is_down=is_down)
+        self._hosts[host].publish(ENDED, encode_message(ended))
 
     def run(
         self,
@@ -97,6 +121,7 @@ class Watched:
         *,
         starts: int = 1,
         outcome: str = "completed",
+        without: tuple[int, ...] = (),
     ) -> bool:
         """Return whether the station ends while agents report these phases; the others are silent.
 
@@ -106,10 +131,12 @@ class Watched:
             armed: whether those that are not done are armed.
             starts: which process of theirs it is.
             outcome: of those that are done.
+            without: peers that they do not wait for.
         """
         for _ in range(round(seconds / 0.2)):
             for agent, phase in phases.items():
-                status = msgspec.structs.replace(status_message(agent=agent, phase=phase), boot_id=starts)
+                status = status_message(agent=agent, phase=phase)
+                status = msgspec.structs.replace(status, boot_id=starts, without=without)
                 done = msgspec.structs.replace(status, armed=False, outcome=outcome)
                 status = done if phase == Phase.DONE else msgspec.structs.replace(status, armed=armed, outcome="")
                 self._agents[agent].publish(STATUS, encode_message(status))
@@ -205,3 +232,125 @@ def test_nobody_is_lost_while_the_station_itself_stands_still(watched: Watched) 
     assert not watched.run(1.0, {})
     watched.watch.close()
     assert watched.watch.problems == []
+
+
+OTHERS = (0, 2)
+OTHERS_TRACK, OTHERS_DONE = dict.fromkeys(OTHERS, Phase.TRACK), dict.fromkeys(OTHERS, Phase.DONE)
+
+
+def test_who_was_excluded_is_not_waited_for_and_the_verdict_says_so(watched: Watched) -> None:
+    assert not watched.run(2.0, OTHERS_TRACK, without=(1,))
+    assert not watched.run(2.0, OTHERS_DONE, without=(1,))
+    assert watched.run(5.0, {})
+    assert (watched.watch.problems, watched.noted[-1]) == ([], ("flown_without", [1]))
+    assert "the others went on without agent-1" in watched.said.getvalue()
+
+
+@pytest.mark.parametrize("phase", [Phase.STANDBY, Phase.DONE])
+def test_an_excluded_agent_that_comes_too_late_is_not_judged(watched: Watched, phase: Phase) -> None:
+    assert not watched.run(2.0, OTHERS_TRACK, without=(1,))
+    assert not watched.run(2.0, {1: phase}, armed=False, outcome="the mission has begun without it")
+    assert not watched.run(2.0, OTHERS_DONE)
+    assert watched.run(5.0, {1: phase}, armed=False, outcome="the mission has begun without it")
+    assert (watched.watch.problems, watched.noted[-1]) == ([], ("flown_without", [1]))
+
+
+def test_an_excluded_agent_that_flies_after_all_is_waited_for(watched: Watched) -> None:
+    assert not watched.run(2.0, dict.fromkeys(OTHERS, Phase.STANDBY), armed=False, without=(1,))
+    assert not watched.run(2.0, ALL_TRACK)
+    assert not watched.run(2.0, OTHERS_DONE)
+    assert not watched.run(60.0, {1: Phase.TRACK})
+    assert not watched.run(2.0, {1: Phase.DONE}, outcome="geofence")
+    assert watched.run(5.0, {})
+    assert watched.watch.problems == ["agent-1 failed: geofence"]
+    assert watched.noted == []
+
+
+def test_nobody_goes_on_without_everybody(watched: Watched) -> None:
+    assert not watched.run(2.0, dict.fromkeys(range(3), Phase.STANDBY), armed=False, without=(0, 1, 2))
+
+
+@pytest.mark.parametrize("boot_id", [1, None])
+def test_who_has_ended_on_the_ground_is_not_waited_for_and_is_named(watched: Watched, boot_id: int | None) -> None:
+    if boot_id is not None:
+        assert not watched.run(2.0, {1: Phase.STANDBY}, armed=False)
+    assert not watched.run(2.0, OTHERS_TRACK)
+    watched.end(1, boot_id=boot_id, is_down=True)
+    assert not watched.run(2.0, OTHERS_DONE)
+    assert watched.run(5.0, {})
+    heard = "none" if boot_id is None else "STANDBY"
+    assert watched.watch.problems == [f"agent-1 failed: it has ended, and its last phase heard is {heard}"]
+
+
+def test_the_news_of_an_end_may_come_before_the_last_status(watched: Watched) -> None:
+    assert not watched.run(2.0, ALL_TRACK)
+    assert not watched.run(2.0, OTHERS_DONE)
+    assert not watched.run(4.0, {1: Phase.TRACK})
+    watched.end(1, is_down=True)
+    assert not watched.run(0.2, {1: Phase.TRACK})
+    assert not watched.run(0.2, {1: Phase.DONE})
+    assert watched.run(5.0, {})
+    assert watched.watch.problems == []
+
+
+def test_old_news_of_an_end_does_not_end_the_next_process(watched: Watched) -> None:
+    assert not watched.run(2.0, {1: Phase.STANDBY}, armed=False)
+    watched.end(1, is_down=True)
+    assert not watched.run(2.0, dict.fromkeys(range(3), Phase.TRACK), starts=2)
+    assert not watched.run(5.0, OTHERS_DONE, starts=2)
+    watched.end(1, is_down=True)
+    assert not watched.run(60.0, {1: Phase.TRACK}, starts=2)
+    assert not watched.run(2.0, {1: Phase.DONE}, starts=2)
+    assert watched.run(5.0, {})
+    assert watched.watch.problems == []
+
+
+def test_who_died_is_named_also_where_its_vehicle_never_left_the_ground(watched: Watched) -> None:
+    assert not watched.run(2.0, {1: Phase.STANDBY}, armed=False)
+    watched.end(1, is_down=False)
+    assert not watched.run(5.0, OTHERS_TRACK)
+    watched.end(1, is_down=False)
+    assert not watched.run(2.0, {1: Phase.DONE}, starts=2, outcome=OPERATOR_STOP)
+    watched.end(1, boot_id=2, is_down=True)
+    assert not watched.run(2.0, OTHERS_DONE)
+    assert watched.run(5.0, {})
+    died = ["agent-1 died before its vehicle was down"]
+    assert (watched.watch.problems, watched.watch.was_stopped) == (died, False)
+
+
+def test_only_who_runs_an_agent_says_that_it_has_ended(watched: Watched) -> None:
+    assert not watched.run(2.0, {1: Phase.STANDBY}, armed=False)
+    assert not watched.run(2.0, OTHERS_TRACK)
+    watched.end(1, is_down=True, host="alpha")
+    assert not watched.run(2.0, OTHERS_DONE)
+    assert not watched.run(60.0, {})
+
+
+@pytest.mark.parametrize("heard", [False, True])
+def test_of_whom_nothing_is_known_the_station_says_so_once_all_others_have_flown(watched: Watched, heard: bool) -> None:
+    if heard:
+        assert not watched.run(1.0, {1: Phase.STANDBY}, armed=False)
+    assert not watched.run(30.0, dict.fromkeys(OTHERS, Phase.STANDBY), armed=False)
+    assert not watched.run(30.0, OTHERS_TRACK)
+    assert not watched.run(20.0, OTHERS_DONE), "80 s"
+    assert watched.run(15.0, {})
+    known = "was last heard in STANDBY" if heard else "was never heard"
+    assert watched.watch.problems == [f"agent-1 {known}: nothing was heard of it for 90 s"]
+
+
+def test_ctrl_c_judges_what_is_known_and_names_who_had_not_ended(watched: Watched) -> None:
+    assert not watched.run(2.0, ALL_TRACK)
+    assert not watched.run(2.0, {0: Phase.DONE, 1: Phase.TRACK, 2: Phase.TRACK}, outcome="geofence")
+    watched.watch.close()
+    assert watched.watch.problems == ["agent-0 failed: geofence"]
+    assert not watched.watch.is_over
+    assert watched.noted == [("not_ended", [1, 2])]
+    assert "had not ended: agent-1 (TRACK), agent-2 (TRACK)" in watched.said.getvalue()
+
+
+def test_ctrl_c_of_a_flight_that_is_over_is_no_interruption(watched: Watched) -> None:
+    assert not watched.run(2.0, OTHERS_TRACK, without=(1,))
+    assert not watched.run(1.0, OTHERS_DONE)
+    watched.watch.close()
+    assert (watched.watch.is_over, watched.watch.problems) == (True, [])
+    assert watched.noted == [("flown_without", [1])]
