@@ -29,7 +29,7 @@ from swarmctl.telemetry.evaluation.run_counts import (
     percentiles,
     solver_counts,
 )
-from swarmctl.telemetry.evaluation.station_clock import by_station_clock
+from swarmctl.telemetry.evaluation.station_clock import ClockedTicks, by_station_clock
 from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
@@ -113,7 +113,7 @@ def evaluate(
     volume, inside = _evaluate_volume(run, tracks, rules, clock)
     timing, punctual = _evaluate_timing(run.ticks, rules, speed_factor)
     tracking, tracked_s = _evaluate_tracking(run, rules.agents, steady_after_s)
-    unseen = [] if len(run.truth) else [*clocked.problems(), *_unseen(known, rules.agents, clock)]
+    unseen = [] if len(run.truth) else [*clocked.problems(), *_unseen(clocked, rules.agents, clock)]
     refused = _shorten(list(refused_peers(run.events)))
     configured = dict(enumerate(rules.goals_ned_m))
     goals_ned_m = {agent: configured.get(agent) for agent in here}
@@ -212,16 +212,17 @@ def _evaluate_separation(
     return found, _shorten(violations)
 
 
-def _unseen(ticks: Mapping[int, NDArray[np.void]], agents: int, clock: _MissionClock) -> Iterator[str]:
+def _unseen(clocked: ClockedTicks, agents: int, clock: _MissionClock) -> Iterator[str]:
     """Yield a violation for each agent that flew without a known position, as its separation can't be judged."""
-    for agent, rows in ticks.items():
-        spans = unseen_spans(flight_rows(rows), "utc_us") if agent < agents else []
+    for agent, ticks in clocked.known.items():
+        rows = flight_rows(ticks)
+        spans = unseen_spans(rows, "utc_us") if agent < agents else []
         if spans:
             seconds, begins_s = sum(end - begin for begin, end in spans) / 1e6, clock.at_s(spans[0][0])
-            yield (
-                f"agent {agent} did not know where its armed vehicle was for {seconds:.1f} s, "
-                f"from {begins_s:.1f} s on: its separation can't be judged"
-            )
+            said = any(((begin < rows["utc_us"]) & (rows["utc_us"] < end)).any() for begin, end in spans)
+            by_station = clocked.ahead_s is not None and not said
+            why = "was not heard by the station" if by_station else "did not know where its armed vehicle was"
+            yield f"agent {agent} {why} for {seconds:.1f} s, from {begins_s:.1f} s on: its separation can't be judged"
 
 
 def _evaluate_obstacles(

@@ -103,6 +103,19 @@ def test_clocks_that_were_corrected_are_told(tmp_path: Path) -> None:
     assert row.value == "agent 1 0.50 s ahead"
 
 
+def test_what_a_station_has_not_heard_is_not_laid_to_an_agent(tmp_path: Path) -> None:
+    run = Station(tmp_path, crossing(0.89, 0.0)).run
+    rows = run.ticks[1]
+    cut = replace(run, ticks={**run.ticks, 1: np.delete(rows, slice(100, 150))})
+    silent = [text for text in evaluate(cut, RULES, "completed")["violations"] if text.startswith("agent 1")]
+    assert len(silent) == 1
+    assert silent[0].startswith("agent 1 was not heard by the station for 1.0 s, from ")
+    rows = run.ticks[1] = rows.copy()
+    rows["state_age_ms"][100:150] = 20.0 * np.arange(50)
+    (stale,) = [text for text in evaluate(run, RULES, "completed")["violations"] if text.startswith("agent 1")]
+    assert "did not know where its armed vehicle was" in stale
+
+
 def test_differences_as_small_as_a_delay_are_not_told() -> None:
     clocks = [{"id": agent, "ahead_s": ahead_s} for agent, ahead_s in enumerate((None, 0.03, -0.03))]
     assert corrected_text(clocks) == corrected_text(None) == ""
