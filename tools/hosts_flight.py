@@ -10,13 +10,19 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import fcntl
+import heapq
 import itertools
 import json
 import os
+import random
+import select
 import shutil
 import signal
+import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -33,11 +39,64 @@ from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, TRUTH, read_par
 CONFIG = Path(__file__).parents[1] / "configs" / "three_hosts.toml"
 INTO_MISSION_S = 2.0  # when something is broken
 CUT_S = 5.0
+LATE_S = 0.1  # of every frame between two hosts, in the scenario of slow links
+LOST_01 = 0.1  # and the share of them that is lost
 STOP_S = 8.0
 START_S = 120.0
 FLIGHT_S = 240.0
 _GRID_US = 20_000
 _NO_HOST = "nobody"
+_TAP = struct.Struct("16sH22x")  # struct ifreq: name and flags
+_TUNSETIFF, _TAP_WITHOUT_HEADER = 0x400454CA, 0x1002
+_LARGEST_FRAME = 65_536
+
+
+class LossySwitch:
+    """A switch that passes frames on late, and not all of them: not every kernel has netem.
+
+    Each of its ports is a TAP device, which is moved to a host's namespace.
+    """
+
+    def __init__(self, ports: int) -> None:
+        self._taps, self.devices = list[int](), list[str]()
+        for port in range(ports):
+            tap, name = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK), f"sw{os.getpid()}t{port}"
+            fcntl.ioctl(tap, _TUNSETIFF, _TAP.pack(name.encode(), _TAP_WITHOUT_HEADER))
+            self._taps.append(tap)
+            self.devices.append(name)
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=self._pass_on)
+
+    def start(self) -> None:
+        """Pass frames on from now on."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Pass on no more; the devices are gone."""
+        self._ends.set()
+        self._thread.join()
+        for tap in self._taps:
+            os.close(tap)
+
+    def _pass_on(self) -> None:
+        on_the_way, places, chance = list[tuple[float, int, int, bytes]](), dict[bytes, int](), random.Random(1)
+        numbers = itertools.count()
+        poll = select.poll()
+        for tap in self._taps:
+            poll.register(tap, select.POLLIN)
+        while not self._ends.is_set():
+            due_ms = 1e3 * (on_the_way[0][0] - time.monotonic()) if on_the_way else 100.0
+            for tap, _ in poll.poll(max(0.0, min(100.0, due_ms))):
+                frame = os.read(tap, _LARGEST_FRAME)
+                places[frame[6:12]] = tap
+                known = places.get(frame[:6])
+                for to in self._taps if known is None else [known]:
+                    if to != tap and chance.random() >= LOST_01:
+                        heapq.heappush(on_the_way, (time.monotonic() + LATE_S, next(numbers), to, frame))
+            while on_the_way and on_the_way[0][0] <= time.monotonic():
+                *_, to, frame = heapq.heappop(on_the_way)
+                with contextlib.suppress(OSError):  # the device is down
+                    os.write(to, frame)
 
 
 @dataclass(kw_only=True)
@@ -46,24 +105,33 @@ class Network:
 
     prefix: str
     ips: dict[str, str]
+    lossy: LossySwitch | None = None
 
     def __enter__(self) -> Network:
-        switch = f"{self.prefix}switch"
-        _ip("netns", "add", switch)
-        _ip("-n", switch, "link", "add", "bridge", "type", "bridge")
-        _ip("-n", switch, "link", "set", "bridge", "up")
+        if self.lossy is None:
+            switch = f"{self.prefix}switch"
+            _ip("netns", "add", switch)
+            _ip("-n", switch, "link", "add", "bridge", "type", "bridge")
+            _ip("-n", switch, "link", "set", "bridge", "up")
         for port, (name, ip) in enumerate(self.ips.items()):
             space = self.space(name)
             _ip("netns", "add", space)
-            _ip("-n", space, "link", "add", "eth0", "type", "veth", "peer", "name", f"p{port}", "netns", switch)
-            _ip("-n", switch, "link", "set", f"p{port}", "master", "bridge", "up")
+            if self.lossy is None:
+                _ip("-n", space, "link", "add", "eth0", "type", "veth", "peer", "name", f"p{port}", "netns", switch)
+                _ip("-n", switch, "link", "set", f"p{port}", "master", "bridge", "up")
+            else:
+                _ip("link", "set", self.lossy.devices[port], "netns", space, "name", "eth0")
             _ip("-n", space, "address", "add", f"{ip}/24", "dev", "eth0")
             for device in ("lo", "eth0"):
                 _ip("-n", space, "link", "set", device, "up")
+        if self.lossy is not None:
+            self.lossy.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for name in (*self.ips, "switch"):
+        if self.lossy is not None:
+            self.lossy.close()
+        for name in (*self.ips, *(() if self.lossy is not None else ("switch",))):
             self.kill(name)
             with contextlib.suppress(subprocess.CalledProcessError):
                 _ip("netns", "delete", self.space(name))
@@ -175,10 +243,12 @@ class Broken:
 
     act: Callable[[Flight], None]
     excused: str = _NO_HOST
+    has_slow_links: bool = False
 
 
 SCENARIOS = {
     "nothing": Broken(_nothing),
+    "slow-links": Broken(_nothing, has_slow_links=True),  # 100 ms and a tenth lost between any two, at all times
     "station-gone": Broken(_station_gone),
     "router-killed": Broken(_router_killed),
     "cut": Broken(_cut),  # of one link, 5 s
@@ -198,7 +268,8 @@ def fly(scenario: str, config_path: Path, folder: Path) -> dict[str, object]:
     config = load(path)
     ips = {host.name: str(ip_of(host.address)) for host in config.hosts}
     ips[STATION] = str(max(map(ip_of, (host.address for host in config.hosts))) + 1)
-    with Network(prefix=f"sw{os.getpid()}-", ips=ips) as network:
+    lossy = LossySwitch(len(ips)) if SCENARIOS[scenario].has_slow_links else None
+    with Network(prefix=f"sw{os.getpid()}-", ips=ips, lossy=lossy) as network:
         flight = Flight(config=config, network=network, folder=folder)
         for host in config.hosts:
             agents = ",".join(map(str, host.agents))
