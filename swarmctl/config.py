@@ -22,6 +22,7 @@ from swarmctl.bus.messages.json_messages import MAX_OBSTACLES
 from swarmctl.bus.network.hosts import HostParams, host_problems, roster_of
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.configuration.constraints import (
+    braking_problems,
     forward_problems,
     obstacle_problems,
     own_controller_problems,
@@ -304,6 +305,7 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
     yield from parameter_problems(config.agent.autopilot_params)
     yield from config.agent.failsafe.problems()
     yield from speed_problems(config.vehicle_models, config.agent.state_machine, config.agent.deadlock)
+    yield from braking_problems(config.vehicle_models, config.agent, separation)
     if config.sitl.speed != 1.0:
         yield (
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 
+from swarmctl.agent.setup import AgentParams
 from swarmctl.agent.sharing.path_sharing import PathSharingParams
 from swarmctl.bus.network.hosts import HostParams
 from swarmctl.configuration.sections import LimitParams, SitlParams, VehicleParams
@@ -16,6 +17,7 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.reference.deadlock_params import DeadlockParams
 from swarmctl.core.flight_volume import VolumeParams
+from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import FARTHEST_M
 from swarmctl.mavlink.geofence import GeofenceParams
@@ -82,6 +84,25 @@ def speed_problems(
     for key, speed_m_s in speeds_m_s.items():
         if speed_m_s > most_m_s:
             yield f"{key} = {speed_m_s:g}: more than vehicle_model.speed_max_m_s = {most_m_s:g}; lower it to that"
+
+
+def braking_problems(
+    models: Sequence[VehicleModelParams], agent: AgentParams, separation: SeparationParams
+) -> Iterator[str]:
+    """Yield which braking is relied on that a vehicle does not have at the tilt it is allowed."""
+    most_m_s2 = GRAVITY_M_S2 * math.tan(min(model.tilt_max_rad for model in models))
+    brakes_m_s2 = {
+        "agent.barrier.brake_m_s2": agent.barrier.brake_m_s2,
+        "agent.commit.brake_m_s2": agent.commit.brake_m_s2,
+        "agent.state_machine.accel_m_s2": agent.state_machine.accel_m_s2,
+        "separation.brake_m_s2": separation.brake_m_s2,
+    }
+    for key, brake_m_s2 in brakes_m_s2.items():
+        if brake_m_s2 > most_m_s2:
+            yield (
+                f"{key} = {brake_m_s2:g}: more than the {most_m_s2:.2f} m/s2 that vehicle_model.tilt_max_rad allows; "
+                "lower it, or allow more tilt"
+            )
 
 
 def volume_problems(

@@ -137,7 +137,7 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start, tmp
             assert not any(key.secret in content or key.secret.hex().encode() in content for key in keys), file
     assert len(list((launched.temp / "state" / "swarmctl" / "signing").iterdir())) == 3
     for agent in ("agent-0", "agent-2"):
-        assert 1 in [row["peer"] for row in launched.events("operator", agent)], "the launch has seen it end"
+        assert 1 in [row["agent"] for row in launched.events("peer_ended", agent)], "the launch has seen it end"
 
 
 def values_told(tlog: Path, name: str) -> list[float]:

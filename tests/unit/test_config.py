@@ -304,6 +304,23 @@ def test_ways_faster_than_a_vehicle_may_fly_are_refused(key: str) -> None:
     load(None, ["vehicle_model.speed_max_m_s=3", f"{key}=3"])
 
 
+BRAKES = (
+    "agent.barrier.brake_m_s2",
+    "agent.commit.brake_m_s2",
+    "agent.state_machine.accel_m_s2",
+    "separation.brake_m_s2",
+)
+
+
+@pytest.mark.parametrize("key", BRAKES)
+def test_braking_that_tilt_does_not_give_is_refused(key: str) -> None:
+    hovering = ["mission.kind=hover", "vehicle_model.tilt_max_rad=0.1"]
+    hovering += [f"{other}=0.9" for other in BRAKES if other != key]
+    with pytest.raises(ConfigError, match=re.escape(f"{key} = 1.1: more than the 0.98 m/s2")):
+        load(None, [*hovering, f"{key}=1.1"])
+    load(None, [*hovering, f"{key}=0.9"])
+
+
 def test_vehicles_beside_the_simulator_are_refused(tmp_path: Path) -> None:
     path = vehicles(tmp_path, "udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")
     (problem,) = refusals(path, "sitl.enabled=true")
