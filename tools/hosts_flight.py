@@ -39,8 +39,6 @@ from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, TRUTH, read_par
 CONFIG = Path(__file__).parents[1] / "configs" / "three_hosts.toml"
 INTO_MISSION_S = 2.0  # when something is broken
 CUT_S = 5.0
-LATE_S = 0.1  # of every frame between two hosts, in the scenario of slow links
-LOST_01 = 0.1  # and the share of them that is lost
 STOP_S = 8.0
 START_S = 120.0
 FLIGHT_S = 240.0
@@ -55,9 +53,15 @@ class LossySwitch:
     """A switch that passes frames on late, and not all of them: not every kernel has netem.
 
     Each of its ports is a TAP device, which is moved to a host's namespace.
+
+    Args:
+        ports: how many there are.
+        late_s: delay of every frame.
+        lost_01: share of the frames that are lost.
     """
 
-    def __init__(self, ports: int) -> None:
+    def __init__(self, ports: int, late_s: float, lost_01: float) -> None:
+        self._late_s, self._lost_01 = late_s, lost_01
         self._taps, self.devices = list[int](), list[str]()
         for port in range(ports):
             tap, name = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK), f"sw{os.getpid()}t{port}"
@@ -91,8 +95,8 @@ class LossySwitch:
                 places[frame[6:12]] = tap
                 known = places.get(frame[:6])
                 for to in self._taps if known is None else [known]:
-                    if to != tap and chance.random() >= LOST_01:
-                        heapq.heappush(on_the_way, (time.monotonic() + LATE_S, next(numbers), to, frame))
+                    if to != tap and chance.random() >= self._lost_01:
+                        heapq.heappush(on_the_way, (time.monotonic() + self._late_s, next(numbers), to, frame))
             while on_the_way and on_the_way[0][0] <= time.monotonic():
                 *_, to, frame = heapq.heappop(on_the_way)
                 with contextlib.suppress(OSError):  # the device is down
@@ -248,7 +252,7 @@ class Broken:
 
 SCENARIOS = {
     "nothing": Broken(_nothing),
-    "slow-links": Broken(_nothing, has_slow_links=True),  # 100 ms and a tenth lost between any two, at all times
+    "slow-links": Broken(_nothing, has_slow_links=True),  # between any two, at all times
     "station-gone": Broken(_station_gone),
     "router-killed": Broken(_router_killed),
     "cut": Broken(_cut),  # of one link, 5 s
@@ -259,8 +263,8 @@ SCENARIOS = {
 }
 
 
-def fly(scenario: str, config_path: Path, folder: Path) -> dict[str, object]:
-    """Fly once and return what came of it."""
+def fly(scenario: str, config_path: Path, folder: Path, *, late_s: float, lost_01: float) -> dict[str, object]:
+    """Fly once and return what came of it; `late_s` and `lost_01` are of slow links."""
     folder.mkdir(parents=True)
     path = folder / config_path.name
     shutil.copy(config_path, path)
@@ -268,7 +272,7 @@ def fly(scenario: str, config_path: Path, folder: Path) -> dict[str, object]:
     config = load(path)
     ips = {host.name: str(ip_of(host.address)) for host in config.hosts}
     ips[STATION] = str(max(map(ip_of, (host.address for host in config.hosts))) + 1)
-    lossy = LossySwitch(len(ips)) if SCENARIOS[scenario].has_slow_links else None
+    lossy = LossySwitch(len(ips), late_s, lost_01) if SCENARIOS[scenario].has_slow_links else None
     with Network(prefix=f"sw{os.getpid()}-", ips=ips, lossy=lossy) as network:
         flight = Flight(config=config, network=network, folder=folder)
         for host in config.hosts:
@@ -340,9 +344,12 @@ def main() -> None:
     parser.add_argument("--only", default=",".join(SCENARIOS), help=f"of {', '.join(SCENARIOS)}")
     parser.add_argument("--runs", type=int, default=1, help="flights of each")
     parser.add_argument("--out", type=Path, required=True, help="new folder for runs and results.jsonl")
+    parser.add_argument("--late-s", type=float, default=0.1, help="delay of slow links")
+    parser.add_argument("--lost-01", type=float, default=0.1, help="share of frames that slow links lose")
     options = parser.parse_args()
     for run, scenario in itertools.product(range(options.runs), options.only.split(",")):
-        result = fly(scenario, options.config, options.out.resolve() / f"{scenario}-{run}")
+        folder = options.out.resolve() / f"{scenario}-{run}"
+        result = fly(scenario, options.config, folder, late_s=options.late_s, lost_01=options.lost_01)
         line = json.dumps(result)
         print(line, flush=True)
         with (options.out / "results.jsonl").open("a", encoding="utf-8") as file:
