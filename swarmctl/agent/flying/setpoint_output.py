@@ -75,13 +75,12 @@ class SetpointOutput:
         virtual_control = self._safety_filter.keep_apart(
             now_us,
             self._ports.utc_of_us(act_us),
-            flown.virtual_control[step],
+            self._holding_height(now_us, flown.virtual_control[step], state, reference),
             start,
             estimate=estimate,
             flies=flies,
             committed_peers=committed_peers,
         )
-        virtual_control = self._holding_height(now_us, virtual_control, state, reference)
         virtual_control = within_tilt(virtual_control, self._model)  # what is remembered is what is flown
         if not flies and state is not None:
             self._heading.begin(euler_from_quat(state.q_nb)[2])
