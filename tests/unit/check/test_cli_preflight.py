@@ -296,6 +296,6 @@ def test_the_view_is_told_of_goals_where_references_come_to_rest() -> None:
     assert 5.0 < circle.extent_m < 7.0
     goals = ((4.0, 0.0, -2.0), (0.0, 4.0, -2.0))
     there = ["swarm.agents=2", "mission.kind=goto", f"mission.goto.goals_ned_m={[list(goal) for goal in goals]}"]
-    shown = viewed_flight(load(None, [*there, "vehicle_model.tilt_max_rad=0.3"]))
+    shown = viewed_flight(load(None, [*there, "vehicle_model.tilt_max_rad=0.4"]))
     assert np.allclose([bounds.goal_ned_m for bounds in shown.agents if bounds.goal_ned_m], goals)
-    assert {bounds.tilt_max_rad for bounds in shown.agents} == {0.3}
+    assert {bounds.tilt_max_rad for bounds in shown.agents} == {0.4}
