@@ -84,7 +84,7 @@ class PathPublisher:
     def _coasts(self, state: VehicleState) -> bool:
         """Return whether a vehicle of which nothing is heard still flies on as its autopilot does without a link."""
         coasts_s = self._ports.autopilot.landing_delay_s
-        if coasts_s is None or state.mode is not FlightMode.EXTERNAL:
+        if coasts_s is None or self._ports.autopilot.setpoint_loss_s is None or state.mode is not FlightMode.EXTERNAL:
             return False
         brakes_s = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)) / self._setup.separation.brake_m_s2
         return self._ports.clock.now_us() - state.t_us <= (coasts_s + brakes_s) * 1e6
@@ -104,9 +104,13 @@ class PathPublisher:
         else:
             now_us = self._ports.clock.now_us()
             t0_us, dt_us = now_us + self._delay_us, self._dt_us
-            pos = self._without_agent(state, grid(self._steps) * (dt_us * 1e-6) + (t0_us - state.t_us) * 1e-6)
-            if not self._is_recent(state):  # as much as peers keep from a path of this age
-                age_s = (now_us - state.t_us) * 1e-6
+            ahead_s = grid(self._steps) * (dt_us * 1e-6) + (t0_us - state.t_us) * 1e-6
+            if self._is_recent(state):
+                stops = self._stop_judge.update(state)
+                pos = predict_constant_velocity(state, ahead_s, self._setup.separation.brake_m_s2, stops=stops)
+            else:
+                pos = self._without_link(state, ahead_s)
+                age_s = (now_us - state.t_us) * 1e-6  # as much as peers keep from a path of this age:
                 margin_m += self._setup.separation.budget.age_margin_m(age_s, parked=False)
         return PredictedPath(
             agent=self._setup.agent,
@@ -118,10 +122,9 @@ class PathPublisher:
             pos_ned_m=pos,
         )
 
-    def _without_agent(self, state: VehicleState, ahead_s: Array) -> Array:
-        """Return positions (N, 3), NED [m], at `ahead_s` (N,) after a state of a vehicle that its autopilot flies."""
-        brake_m_s2, autopilot = self._setup.separation.brake_m_s2, self._ports.autopilot
-        keeps_s, coasts_s = autopilot.setpoint_loss_s, autopilot.landing_delay_s
-        if self._is_recent(state) or keeps_s is None or coasts_s is None:
-            return predict_constant_velocity(state, ahead_s, brake_m_s2, stops=self._stop_judge.update(state))
+    def _without_link(self, state: VehicleState, ahead_s: Array) -> Array:
+        """Return positions (N, 3), NED [m], at `ahead_s` (N,) after the last state of a vehicle that `_coasts`."""
+        keeps_s, coasts_s = self._ports.autopilot.setpoint_loss_s, self._ports.autopilot.landing_delay_s
+        assert keeps_s is not None and coasts_s is not None
+        brake_m_s2 = self._setup.separation.brake_m_s2
         return predict_without_setpoints(state, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)

@@ -31,7 +31,7 @@ from swarmctl.ops.orders.operator import list_setters
 from swarmctl.ops.processes import ROUTER, VIEWER
 from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.launch_result import LaunchResult
-from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper, adoption_text
+from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.supervision.recovery import RECOVERY_S
 from swarmctl.ops.supervision.sender_clocks import SenderClocks
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
@@ -187,11 +187,8 @@ class SwarmWatch:
 
     def _keep_obstacles(self) -> None:
         """Repeat the list of obstacles, record what hosts keep clear of, and say what operators have to know."""
-        for adoption in self._obstacles.receive():
-            if overruled := adoption_text(adoption.before, adoption.after):
-                self._say("obstacles_overruled", overruled)
-        for text in self._obstacles.others():
-            self._say("obstacles_elsewhere", text)
+        for event, text in self._obstacles.news(self._obstacles.receive()):
+            self._say(event, text)
         heard = self._obstacles.heard
         if heard is not None and heard is not self._recorded_list:
             self._recorded_list = heard

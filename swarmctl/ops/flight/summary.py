@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from swarmctl.bus.bus import agent_name
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
 from swarmctl.errors import StartError
@@ -130,7 +131,7 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
 
 def _without(summary: Mapping[str, Any]) -> str:
     """Return without whom the others have flown; "" where everybody has."""
-    names = ", ".join(f"agent-{agent}" for agent in summary.get("without") or ())
+    names = ", ".join(map(agent_name, summary.get("without") or ()))
     return f" without {names}" if names else ""
 
 

@@ -5,7 +5,7 @@ Stamps are by the clock of the launch, as its agents have it: it follows steps o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -90,6 +90,14 @@ class ObstacleKeeper:
         """Return, once each, which computers repeat a newer list that no operator has told this one."""
         others, self._others = self._others, []
         return others
+
+    def news(self, adopted: Iterable[Adoption]) -> Iterator[tuple[str, str]]:
+        """Yield the events, and their texts, that tell operators of lists which were overruled, or are elsewhere."""
+        for adoption in adopted:
+            if overruled := adoption_text(adoption.before, adoption.after):
+                yield "obstacles_overruled", overruled
+        for text in self.others():
+            yield "obstacles_elsewhere", text
 
     def repeat(self) -> None:
         """Publish the list again if it is time."""

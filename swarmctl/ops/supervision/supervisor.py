@@ -26,7 +26,7 @@ from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.ended_processes import EndedProcesses
 from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
-from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper, adoption_text
+from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.supervision.standstill import Standstill
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
@@ -172,13 +172,12 @@ class FlightSupervisor:
             if status.phase == Phase.TRACK:  # also of a mission that an operator has set
                 self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + status.ends_in_s)
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
-        for adoption in self._obstacles.receive():
+        adopted = self._obstacles.receive()
+        for adoption in adopted:
             text = f"{len(adoption.after.obstacles)} obstacles, set by an operator"
             self._announce("obstacles", text, **recorded_list(adoption.after))
-            if overruled := adoption_text(adoption.before, adoption.after):
-                self._announce("obstacles_overruled", overruled)
-        for text in self._obstacles.others():
-            self._announce("obstacles_elsewhere", text)
+        for event, text in self._obstacles.news(adopted):
+            self._announce(event, text)
         self._report.step()
 
     def _watch_essential_processes(self) -> None:
