@@ -14,6 +14,7 @@ import json
 import logging
 import math
 import random
+import struct
 import sys
 import tempfile
 import time
@@ -42,7 +43,10 @@ from swarmctl.bus.messages.json_messages import (
     encode_message,
 )
 from swarmctl.bus.messages.path_messages import decode_path, encode_path
+from swarmctl.bus.network.datagram_routes import DatagramRoutes
+from swarmctl.bus.network.datagrams import DatagramChannel
 from swarmctl.bus.network.hosts import roster_of
+from swarmctl.bus.network.roster import Roster
 from swarmctl.bus.network.seals import KEY_BYTES, Sealer, SealVerifier
 from swarmctl.bus.relay import decode_relay, encode_relay
 from swarmctl.config import load
@@ -175,6 +179,29 @@ class Files:
         return self._read(self._folder)
 
 
+class Datagrams:
+    """The way in by the port of datagrams: of a stranger, and of a computer of the swarm whose key seals anything."""
+
+    def __init__(self, roster: Roster, paths: Sequence[bytes]) -> None:
+        key, name = bytes(KEY_BYTES), "alpha"
+        self._routes = DatagramRoutes(roster, name, [key] * len(roster.speakers), {}, session=1)
+        self._peer = DatagramChannel(key, me=1, other=0, session=2)
+        self.take(self._peer.seal(b""))
+        self._peer.open(self._routes.take(self._peer.seal(b"hello"), ("10.0.0.2", 1), 0.0).outgoing[0][0])
+        beat, message, another = (struct.pack("<BQ", kind, 3) for kind in range(3))
+        named = message + bytes((16,)) + b"run/agent-2/path"
+        self.sent = [self._peer.seal(beat)]
+        self.bodies = [beat, *(named + path for path in paths), another + self.sent[0]]
+
+    def take(self, data: bytes) -> object:
+        """Take a datagram from anywhere."""
+        return self._routes.take(data, ("10.0.0.3", 1), 0.0)
+
+    def take_sealed(self, data: bytes) -> object:
+        """Take a datagram with this body, from who may send it."""
+        return self.take(self._peer.seal(data))
+
+
 def targets(folder: Path) -> dict[str, Target]:
     """Return every way in, with what a flight has sent as seeds."""
     sent = flown_bytes(folder / "flight")
@@ -191,6 +218,7 @@ def targets(folder: Path) -> dict[str, Target]:
     sealed = [sealer.seal("path", payload, 1_800_000_000_000_000) for payload in seeds["path"]]
     verifier = SealVerifier(roster, [shared[0]] * len(shared), "run", me="alpha", max_age_us={})
     flight = Lockstep(load(None, ("swarm.agents=1",)))
+    datagrams = Datagrams(roster, seeds["path"][:4])
     fault = json.dumps({"fault": {"kind": "gust", "vehicle": 0, "value": 3.0, "for_s": 2.0}}).encode()
     found = {
         "path": Target(seeds["path"], decode_path),
@@ -202,6 +230,8 @@ def targets(folder: Path) -> dict[str, Target]:
         "ended": Target(seeds["ended"], decode_ended),
         "obstacles": Target(seeds["obstacles"], decode_obstacles),
         "sealed": Target(sealed, lambda data: verifier.open("agent-0", "path", data, 1_800_000_000_000_000)),
+        "datagram": Target(datagrams.sent, datagrams.take),
+        "datagram, true sender": Target(datagrams.bodies, datagrams.take_sealed),
         "tick row": Target(seeds["tick"], unpack_tick),
         "frames": Target(seeds["mavlink"], lambda data: [codec.decode(frame) for frame in frames(data, True)]),
         "frames, checksum right": Target(

@@ -16,7 +16,7 @@ from swarmctl.bus.topics import RELAY, TOO_LONG, TRAJECTORY, Topic
 from swarmctl.core.trajectory_message import TrajectoryMessage
 
 RELAY_VERSION = 1
-_RELAY_AFTER_US = 80_000  # without a message of the other one, after which a peer is helped
+_RELAY_AFTER_PERIODS = 4  # without a message of the other one, after which a peer is helped: one or two get lost
 _HELPED_US = 3_000_000  # a peer that was itself not heard for this long is not
 _MAGIC = b"SR"
 _HEADER = struct.Struct("<2sBB")  # magic, version, count
@@ -97,7 +97,7 @@ class RelayingBus(ForwardingBus):
 
 
 def missed_by_peers(
-    newest: Mapping[int, TrajectoryMessage], utc_us: int, received_utc_us: Mapping[int, int]
+    newest: Mapping[int, TrajectoryMessage], utc_us: int, received_utc_us: Mapping[int, int], *, period_us: int
 ) -> list[int]:
     """Return the agents whose newest message some peer lacks, having heard none of theirs for a while.
 
@@ -107,6 +107,7 @@ def missed_by_peers(
         newest: message of each peer.
         utc_us: now.
         received_utc_us: when each of them arrived.
+        period_us: of every agent's messages.
     """
     found = set[int]()
     for peer, message in newest.items():
@@ -116,6 +117,6 @@ def missed_by_peers(
             if agent == peer or agent in found:
                 continue
             stamp_us, arrival_us = message.heard.get(agent, (0, 0))
-            if message.sent_utc_us - arrival_us > _RELAY_AFTER_US and other.sent_utc_us > stamp_us:
+            if message.sent_utc_us - arrival_us > _RELAY_AFTER_PERIODS * period_us and other.sent_utc_us > stamp_us:
                 found.add(agent)
     return sorted(found)

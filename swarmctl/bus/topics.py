@@ -31,7 +31,7 @@ ANSWER = Topic(name="answer", ring=16, max_bytes=4096, reliable=True)
 OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
 MISSION = Topic(name="mission", ring=4, max_bytes=MAX_MISSION_BYTES, reliable=True)
 TRAJECTORY = Topic(name="trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
-RELAY = Topic(name="relay", ring=4, max_bytes=131_072, reliable=False)  # trajectory messages of others
+RELAY = Topic(name="relay", ring=4, max_bytes=60_000, reliable=False)  # trajectory messages of others
 TOPICS = (PATH, FAR_PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, MISSION, TRAJECTORY, RELAY)
 FOR_AGENTS = (PATH, FAR_PATH, STATUS, COMMAND, ENDED, OBSTACLES, MISSION, TRAJECTORY, RELAY)
 

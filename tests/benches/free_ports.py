@@ -7,9 +7,14 @@ import socket
 
 
 def free_ports(count: int) -> list[int]:
-    """Return ports that were free a moment ago; nothing else on this machine asks for them by number."""
+    """Return ports that were free a moment ago, as their next ones; nothing else here asks for them by number."""
     with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
-        for sock in sockets:
+        found: list[int] = []
+        while len(found) < count:
+            sock, beside = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
             sock.bind(("127.0.0.1", 0))
-        return [int(sock.getsockname()[1]) for sock in sockets]
+            port = int(sock.getsockname()[1])
+            with contextlib.suppress(OSError, OverflowError):
+                beside.bind(("127.0.0.1", port + 1))
+                found.append(port)
+        return found

@@ -158,7 +158,7 @@ def test_the_others_arrive_once_the_vehicle_of_a_frozen_agent_has_landed(landed:
 def test_all_arrive_although_links_fail_for_seconds(relayed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each direction between two agents delivers nothing for two fifths of the time, 2 s at once."""
     if not relayed:
-        monkeypatch.setattr(coordination, "missed_by_peers", lambda *_: [])
+        monkeypatch.setattr(coordination, "missed_by_peers", lambda *_, **__: [])
     cell = replace(GUARANTEED_SWAP, disturbance="bursts:0.4")
     flight = TrialFlight(Trial(cell, 2), replace(drawn(cell, 2), limit_s=12.0))
     flight.run()

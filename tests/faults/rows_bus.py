@@ -190,7 +190,7 @@ ROWS = (
             happens=cut(between(one, other), 5.0),
             reacts=arrived,
             lasts_s=16.5,
-            off=Off(patches=((coordination, "missed_by_peers", lambda *_: []),)),
+            off=Off(patches=((coordination, "missed_by_peers", lambda *_, **__: []),)),
         )
         for a, b, one, other in (
             ("alpha", "bravo", (0,), (1, 2)),
@@ -220,7 +220,7 @@ ROWS = (
         happens=cut([(VICTIM, 0)], 7.0),
         reacts=arrived,
         lasts_s=7.5,
-        off=Off(patches=((coordination, "missed_by_peers", lambda *_: ()),)),
+        off=Off(patches=((coordination, "missed_by_peers", lambda *_, **__: ()),)),
     ),
     SimulatedRow(
         name="isolated-2.5s",

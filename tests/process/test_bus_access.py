@@ -5,6 +5,8 @@ Charlie is the intruder: its router obeys no access control, and its clients say
 
 from __future__ import annotations
 
+import socket
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -13,12 +15,15 @@ from pathlib import Path
 import pytest
 
 from swarmctl.bus.bus import Bus
+from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identities import add_identity, make_identities, revoke_identity
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
+from swarmctl.bus.network.router import run_router
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.topics import COMMAND, ENDED, MISSION, OBSTACLES, PATH, STATUS, Topic
-from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
+from swarmctl.errors import StartError
 from tests.benches.free_ports import free_ports
 from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
 
@@ -32,7 +37,14 @@ SAID = (
     *((name, topic) for name in ("alpha", "charlie") for topic in (MISSION, OBSTACLES)),
 )
 OPEN = "import swarmctl.bus.network.router_links as links; links.access_settings = lambda *_: {}\n"
-ROGUE = ("-c", OPEN + "from swarmctl.bus.network.router import main\nraise SystemExit(main())")
+RUN = "from swarmctl.bus.network.router import main\nraise SystemExit(main())"
+ROGUE = ("-c", OPEN + RUN)
+MUTE = (
+    "import swarmctl.bus.network.datagram_links as carried\n"
+    "carried.DatagramLinks._send = carried.DatagramLinks._publish = lambda *_: None\n"
+)
+WITHOUT_DATAGRAMS = ("-c", MUTE + RUN)
+ROGUE_WITHOUT_DATAGRAMS = ("-c", OPEN + MUTE + RUN)
 LINK_S = 1.5
 WAIT_S = 20.0
 
@@ -51,12 +63,16 @@ def new_swarm(folder: Path, *, relay: bool = False) -> SwarmOfHosts:
 
 @contextmanager
 def routers(
-    swarm: SwarmOfHosts, *, lawless: tuple[str, ...] = ("charlie",), stolen: Path | None = None
+    swarm: SwarmOfHosts,
+    *,
+    lawless: tuple[str, ...] = ("charlie",),
+    rogue: tuple[str, ...] = ROGUE,
+    stolen: Path | None = None,
 ) -> Iterator[None]:
-    """Run the three routers; those of `lawless` obey no access control, charlie has the files of `stolen`."""
+    """Run the three routers; those of `lawless` are `rogue` ones, charlie has the files of `stolen`."""
     with ExitStack() as stack:
         for host in swarm.hosts:
-            options = ROGUE if host.name in lawless else ()
+            options = rogue if host.name in lawless else ()
             folder = stolen if host.name == "charlie" else None
             stack.enter_context(swarm.router(host.name, *options, folder=folder))
         yield
@@ -110,7 +126,25 @@ def test_who_relays_passes_on_what_others_say(tmp_path: Path) -> None:
     swarm = new_swarm(tmp_path, relay=True)
     with routers(swarm):
         heard = what_is_heard(swarm, ("charlie",))
-    assert ("charlie", "agent-1", "path") in heard["alpha"], "seals alone tell that bravo has not said it"
+    assert ("charlie", "bravo", "ended") in heard["alpha"], "seals alone tell that bravo has not said it"
+    assert ("charlie", "agent-1", "path") not in heard["alpha"], "datagrams are not passed on in another's name"
+
+
+def test_links_of_routers_do_not_carry_what_may_be_lost(swarm: SwarmOfHosts) -> None:
+    """A link that waits for lost frames would bring paths seconds late."""
+    with routers(swarm, lawless=("bravo",), rogue=WITHOUT_DATAGRAMS):
+        heard = what_is_heard(swarm, ("alpha", "bravo"))
+    assert {said for said in heard["alpha"] if said[0] == "bravo"} == {("bravo", "bravo", "ended")}
+    assert {topic for at, _, topic in heard["bravo"] if at == "alpha"} == {"command", "mission", "obstacles"}
+
+
+def test_a_router_whose_port_for_datagrams_is_taken_says_which(swarm: SwarmOfHosts) -> None:
+    port = int(swarm.hosts[0].address.rpartition(":")[2]) + 1
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", port))
+        links = links_of(swarm.hosts, swarm.identity("alpha"))
+        with pytest.raises(StartError, match=rf"127\.0\.0\.1 port {port}: .*in use.*port after that of the host"):
+            run_router(f"{SCHEME}{tempfile.mkdtemp(prefix='sw')}/bus.sock", links)
 
 
 def test_a_revoked_identity_has_a_link_and_no_rights(
@@ -148,7 +182,7 @@ def sealed(swarm: SwarmOfHosts, at: str, sender: str, folder: Path | None = None
 
 
 def test_sealed_messages_pass_between_hosts_and_plain_ones_are_counted(swarm: SwarmOfHosts) -> None:
-    with routers(swarm, lawless=("alpha", "bravo", "charlie")):
+    with routers(swarm, lawless=("alpha", "bravo", "charlie"), rogue=ROGUE_WITHOUT_DATAGRAMS):
         alpha, bravo = sealed(swarm, "alpha", "agent-0"), sealed(swarm, "bravo", "agent-1")
         forger: ZenohBus = swarm.plain("charlie", "agent-1")
         heard, refused = set[tuple[str, bytes]](), set[tuple[str, str, str]]()

@@ -18,7 +18,7 @@ def test_nothing_that_a_decoder_is_given_raises_or_takes_long(tmp_path: Path) ->
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     counts = json.loads(state.read_text())
-    assert len(counts) == 22
+    assert len(counts) == 24
     assert min(counts.values()) > 0
 
 

@@ -99,6 +99,7 @@ class Coordination:
         )
         self._peers = frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
+        self._period_us = round(1e6 / rate_hz)
         self._is_committed = False
         self._tube_m = separation.budget.tube_m
         self._tube = Tube(self._tube_m)
@@ -257,7 +258,8 @@ class Coordination:
         )
         self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
         peers = self._peer_trajectories
-        self._bus.relay(missed_by_peers(peers.newest, utc_us, peers.received_utc_us))
+        missed = missed_by_peers(peers.newest, utc_us, peers.received_utc_us, period_us=self._period_us)
+        self._bus.relay(missed)
 
     @property
     def margin_m(self) -> float:

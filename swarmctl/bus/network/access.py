@@ -11,24 +11,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from swarmctl.bus.network.roster import Roster, Speaker
-from swarmctl.bus.topics import (
-    ANSWER,
-    COMMAND,
-    ENDED,
-    FAR_PATH,
-    MISSION,
-    OBSTACLES,
-    PATH,
-    RELAY,
-    STATUS,
-    TICK,
-    TRAJECTORY,
-)
+from swarmctl.bus.topics import ANSWER, COMMAND, ENDED, MISSION, OBSTACLES, TOPICS
 
 _LISTENING = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query", "query")
 _SPEAKING = ("put", "delete", "liveliness_token", "declare_queryable", "reply")
 _ALIVE = "alive"  # of liveliness tokens
-_OF_AGENTS = (*(topic.name for topic in (PATH, FAR_PATH, STATUS, TICK, ANSWER, TRAJECTORY, RELAY)), _ALIVE)
+_LINKED = (*(topic.name for topic in TOPICS if topic.reliable), _ALIVE)  # what links of routers carry
+_OF_AGENTS = (ANSWER.name, _ALIVE)
+_OF_CLIENTS = (*(topic.name for topic in TOPICS if not topic.reliable), *_OF_AGENTS)
 _OF_COMPUTERS = (ENDED.name, _ALIVE)
 _OF_OPERATORS = (COMMAND.name, MISSION.name, OBSTACLES.name)
 _EVERYTHING = "swarm/**"
@@ -44,6 +34,7 @@ def access_settings(roster: Roster, me: str, common_names: Mapping[str, str]) ->
         common_names: of the trusted certificates, by identity; who is not listed may say nothing.
     """
     rules = [_rule("send", "egress", (*_SPEAKING, *_LISTENING), [_EVERYTHING])]
+    rules += [_rule("link", "egress", (*_SPEAKING, *_LISTENING), [f"swarm/*/*/{name}" for name in _LINKED])]
     rules += [_rule("listen", "ingress", _LISTENING, [_EVERYTHING])]
     subjects, policies = [], []
     for speaker in roster.speakers:
@@ -56,7 +47,8 @@ def access_settings(roster: Roster, me: str, common_names: Mapping[str, str]) ->
     for subject in subjects:
         own = [f"say {subject['id']}"]
         says = said if roster.relay and subject["id"] != me else own
-        policies.append({"rules": ["send", "listen", *says], "subjects": [subject["id"]]})
+        sends = "send" if subject["id"] == me else "link"
+        policies.append({"rules": [sends, "listen", *says], "subjects": [subject["id"]]})
     control = {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects}
     return {"access_control": control | {"policies": policies}}
 
@@ -74,9 +66,9 @@ def _keys(speaker: Speaker, me: Speaker) -> list[str]:
         own += _OF_OPERATORS
     elif me.operator:
         own.append(OBSTACLES.name)  # who changes the list knows what others keep clear of; it is not adopted by itself
-    agents = speaker.senders[1:]
+    agents, topics = speaker.senders[1:], _OF_CLIENTS if speaker == me else _OF_AGENTS
     return [f"swarm/*/{speaker.name}/{name}" for name in own] + [
-        f"swarm/*/{agent}/{name}" for agent in agents for name in _OF_AGENTS
+        f"swarm/*/{agent}/{name}" for agent in agents for name in topics
     ]
 
 

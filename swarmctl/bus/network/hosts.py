@@ -23,7 +23,7 @@ class HostParams(Params):
     """One computer of a swarm that flies from several, and its agents."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")  # of its identity, and in messages
-    address: str  # IP:PORT at which the routers of other computers reach its router, over UDP
+    address: str  # IP:PORT at which the routers of other computers reach its router, over UDP; PORT + 1 for datagrams
     agents: Annotated[tuple[int, ...], Field(strict=False, min_length=1)]  # numbers of those that run there
     operator: bool = False  # agents of other hosts obey what is ordered there; its own ones and the station's always do
 
@@ -35,6 +35,7 @@ def host_problems(hosts: Sequence[HostParams], agents: int) -> Iterator[str]:
             yield f"hosts.{i}.name = {host.name!r}: reserved; choose another"
         if problem := _address_problem(host.address):
             yield f"hosts.{i}.address = {host.address!r}: {problem}; write IP:PORT, for example 192.168.1.20:7448"
+    yield from _clashes(hosts)
     for key, values in (("name", [h.name for h in hosts]), ("address", [h.address for h in hosts])):
         yield from (f"hosts: {key} {value!r} is given {n} times" for value, n in Counter(values).items() if n > 1)
     counts = Counter(agent for host in hosts for agent in host.agents)
@@ -45,6 +46,16 @@ def host_problems(hosts: Sequence[HostParams], agents: int) -> Iterator[str]:
         yield f"hosts: there are no agents {unknown}; swarm.agents = {agents}"
 
 
+def _clashes(hosts: Sequence[HostParams]) -> Iterator[str]:
+    """Yield where datagrams, which go to the port after that of an address, would meet something else."""
+    places = {(ip_of(host.address), _port(host.address)): host.name for host in hosts if not _address_problem(host.address)}
+    for (ip, port), name in places.items():
+        if other := places.get((ip, port + 1)):
+            yield f"hosts: port {port + 1} of {ip} is {other}'s and that of datagrams to {name}; leave one port between"
+    if len({ip.version for ip, _ in places}) > 1:
+        yield "hosts: addresses are of IPv4 and of IPv6; use one kind for all"
+
+
 def roster_of(hosts: Sequence[HostParams], *, relay: bool) -> Roster:
     """Return the identities of these hosts, and the station's, which is always an operator's."""
     speakers = [
@@ -53,6 +64,7 @@ def roster_of(hosts: Sequence[HostParams], *, relay: bool) -> Roster:
             agents=host.agents,
             senders=(host.name, *map(agent_name, host.agents)),
             operator=host.operator,
+            address=host.address,
         )
         for host in hosts
     ]
@@ -78,9 +90,13 @@ def ip_of(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
         ValueError: it is not of this form.
     """
     ip, _, port = address.rpartition(":")
-    if not port.isascii() or not port.isdigit() or not 0 < int(port) < 65536:
-        raise ValueError(f"{port!r} is no port")
+    if not port.isascii() or not port.isdigit() or not 0 < int(port) < 65535:
+        raise ValueError(f"{port!r} is no port from 1 to 65534")
     return ipaddress.ip_address(ip.removeprefix("[").removesuffix("]"))
+
+
+def _port(address: str) -> int:
+    return int(address.rpartition(":")[2])
 
 
 def _address_problem(address: str) -> str:

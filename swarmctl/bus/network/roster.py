@@ -20,12 +20,14 @@ class Speaker:
         agents: numbers of those that run there.
         senders: every name under which it speaks, its own first.
         operator: agents of other computers obey it.
+        address: `IP:PORT` of its router; "" for the station, which may be anywhere.
     """
 
     name: str
     agents: tuple[int, ...]
     senders: tuple[str, ...]
     operator: bool
+    address: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +94,7 @@ def identity_of_json(text: str) -> OwnIdentity:
             agents=tuple(item["agents"]),
             senders=tuple(item["senders"]),
             operator=item["operator"],
+            address=item["address"],
         )
         for item in tree["roster"]["speakers"]
     )

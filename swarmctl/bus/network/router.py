@@ -3,7 +3,8 @@
 Clients reach it on a Unix socket in a private directory. Other routers reach it over QUIC, which is UDP, because a host
 that vanishes from a TCP link freezes the data of all the others for 10 s (zenoh #1101). Both ends of such a link prove
 by certificates of the swarm's own authority that they belong to it; there is no link without, and each may bring only
-what the computer of this certificate may say (`swarmctl.bus.network.access`).
+what the computer of this certificate may say (`swarmctl.bus.network.access`). Messages that may be lost do not take
+these links: each is a datagram (`swarmctl.bus.network.datagram_links`).
 
 `python -m swarmctl.bus.network.router unixsock-stream/DIR/bus.sock` is the router of a launch on one computer.
 """
@@ -13,8 +14,9 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import zenoh
 
@@ -31,6 +33,9 @@ from swarmctl.bus.zenoh_bus import (
 from swarmctl.errors import StartError, SwarmError
 from swarmctl.process_lifetime import die_with_parent, remove_socket
 from swarmctl.process_priority import request_realtime
+
+if TYPE_CHECKING:
+    from swarmctl.bus.network.datagram_links import DatagramLinks
 
 
 def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: bool = False) -> None:
@@ -50,25 +55,35 @@ def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: boo
     zenoh.init_log_from_env_or("error")
     endpoints = [endpoint, *([f"quic/{links.listen}"] if links is not None and links.listen else [])]
     settings = COMMON_SETTINGS | {"mode": "router", "listen/endpoints": endpoints, "scouting/delay": 0}
+    link_settings, carry_datagrams = _linked(links)
     try:
-        session = open_session(settings | _link_settings(links))
+        session = open_session(settings | link_settings)
     except zenoh.ZError as error:
         where = " and ".join(repr(place) for place in endpoints)
         raise StartError(f"bus endpoint {where}: can't be opened: {error}. Is another router using it?") from error
+    datagrams = carry_datagrams(session)
     if realtime:
         request_realtime()
     print(f"router ready {endpoint}", flush=True)
     signal.sigwait({signal.SIGTERM})
+    if datagrams is not None:
+        datagrams.close()
     close_within(session, CLOSE_DEADLINE_S)
     remove_socket(socket_path)
 
 
-def _link_settings(links: RouterLinks | None) -> dict[str, Any]:
+def _linked(links: RouterLinks | None) -> tuple[dict[str, Any], Callable[[Any], DatagramLinks | None]]:
+    """Return what Zenoh is told of links to other computers, and what a session is given to for datagrams to them."""
     if links is None:
-        return {}
-    from swarmctl.bus.network.keyring import load_keyring  # loads cryptography, which one computer alone does not need
+        return {}, lambda _: None
+    # They load cryptography, which one computer alone does not need
+    from swarmctl.bus.network.datagram_links import DatagramLinks, bind_datagrams
+    from swarmctl.bus.network.keyring import load_keyring
 
-    return links.settings(load_keyring(links.identity).common_names)
+    identity = links.identity
+    keyring, sock = load_keyring(identity), bind_datagrams(identity)
+    settings = links.settings(keyring.common_names)
+    return settings, lambda session: DatagramLinks(session, identity, keyring.keys, sock)
 
 
 def _private_socket(endpoint: str) -> Path:

@@ -104,7 +104,7 @@ def message(agent: int, *, sent_us: int, heard: dict[int, tuple[int, int]]) -> T
     )
 
 
-NOW_US = 10_000_000
+NOW_US, PERIOD_US = 10_000_000, 20_000
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_who_is_missed_follows_from_what_peers_say_they_have_heard(
         1: message(1, sent_us=NOW_US, heard=heard),
         2: message(2, sent_us=9_990_000, heard={1: (NOW_US, 9_980_000)}),
     }
-    assert missed_by_peers(newest, NOW_US, {1: received_us, 2: NOW_US}) == missed
+    assert missed_by_peers(newest, NOW_US, {1: received_us, 2: NOW_US}, period_us=PERIOD_US) == missed
 
 
 def test_clocks_that_differ_by_hours_make_no_difference() -> None:
@@ -135,4 +135,14 @@ def test_clocks_that_differ_by_hours_make_no_difference() -> None:
         1: message(1, sent_us=NOW_US + hours_us, heard={2: (9_980_000, NOW_US + hours_us - 20_000)}),
         2: message(2, sent_us=9_990_000, heard={1: (NOW_US + hours_us, 9_980_000)}),
     }
-    assert missed_by_peers(newest, NOW_US, {1: NOW_US, 2: NOW_US}) == []
+    assert missed_by_peers(newest, NOW_US, {1: NOW_US, 2: NOW_US}, period_us=PERIOD_US) == []
+
+
+def test_agents_that_send_less_often_are_helped_later() -> None:
+    newest = {
+        1: message(1, sent_us=NOW_US, heard={2: (9_890_000, 9_900_000)}),
+        2: message(2, sent_us=9_990_000, heard={1: (NOW_US, 9_980_000)}),
+    }
+    received_us = {1: NOW_US, 2: NOW_US}
+    assert missed_by_peers(newest, NOW_US, received_us, period_us=20_000) == [2]
+    assert missed_by_peers(newest, NOW_US, received_us, period_us=40_000) == [], "two in a row may get lost"

@@ -1,0 +1,165 @@
+"""Carries topics that may be lost between the routers of several computers, beside Zenoh's own links.
+
+A router's link is one ordered stream: where the network loses frames, everything waits for the lost ones to be sent
+again, and a congested stream keeps seconds of paths that nobody needs any more. So links carry what has to arrive, and
+each message of the other topics is a datagram (`swarmctl.bus.network.datagrams`) that arrives at once or never.
+
+The socket is at the port after that of the router's own address; the station, which has none, sends from any.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import secrets
+import socket
+import sys
+import threading
+import time
+from typing import Any
+
+import zenoh
+
+from swarmctl.bus.network.datagram_routes import BEAT_S, Address, DatagramRoutes, Outgoing
+from swarmctl.bus.network.roster import OwnIdentity
+from swarmctl.bus.network.seals import PairKeys
+from swarmctl.bus.topics import TOPICS
+from swarmctl.errors import StartError
+
+_PREFIX = "swarm/"
+_WAKE_S = 0.02
+_BUFFER_BYTES = 1 << 20
+_MOST_AT_ONCE = 256  # datagrams that are taken between two beats
+_TOLD_EVERY_S = 10.0
+_MOST_PUBLISHERS = 1024
+
+
+def datagram_address(address: str) -> Address:
+    """Return where the datagrams to a router go that is at `IP:PORT`: to the next port."""
+    ip, _, port = address.rpartition(":")
+    return ip.removeprefix("[").removesuffix("]"), int(port) + 1
+
+
+class DatagramLinks:
+    """Sends the messages of a router's clients to other routers, and theirs to the clients.
+
+    Args:
+        session: of the router.
+        identity: own one, with everybody's addresses.
+        keys: shared with each identity of the roster, in its order.
+        sock: see `bind_datagrams`; is closed at the end.
+    """
+
+    def __init__(self, session: Any, identity: OwnIdentity, keys: PairKeys, sock: socket.socket) -> None:
+        addresses, number = _addresses(identity), secrets.randbits(64) or 1
+        self._session, self._socket = session, sock
+        self._routes = DatagramRoutes(identity.roster, identity.name, keys, addresses, session=number)
+        self._lock = threading.Lock()  # Zenoh's threads send, the own one receives
+        self._publishers: dict[str, Any] = {}
+        self._ends = threading.Event()
+        self._told_s, self._told = time.monotonic(), 0
+        self._subscribers = [
+            session.declare_subscriber(
+                f"{_PREFIX}*/*/{topic.name}",
+                zenoh.handlers.Callback(self._send, indirect=False),
+                allowed_origin=zenoh.Locality.REMOTE,
+            )
+            for topic in TOPICS
+            if not topic.reliable
+        ]
+        self._thread = threading.Thread(target=self._run, name="datagrams", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Send and receive nothing from now on."""
+        self._ends.set()
+        self._thread.join()
+        for subscriber in self._subscribers:
+            with contextlib.suppress(zenoh.ZError):
+                subscriber.undeclare()
+        self._socket.close()
+
+    def _send(self, sample: Any) -> None:
+        """Send what a client has published."""
+        key = str(sample.key_expr).removeprefix(_PREFIX)
+        with self._lock:
+            outgoing = self._routes.send(key, sample.payload.to_bytes(), time.monotonic())
+        self._send_all(outgoing)
+
+    def _send_all(self, outgoing: Outgoing) -> None:
+        for datagram, address in outgoing:
+            with contextlib.suppress(OSError):  # no route, or the buffer is full: it is lost, as others are
+                self._socket.sendto(datagram, address)
+
+    def _run(self) -> None:
+        beat_s = time.monotonic()
+        while not self._ends.is_set():
+            now_s = time.monotonic()
+            if now_s >= beat_s:
+                beat_s = now_s + BEAT_S
+                with self._lock:
+                    outgoing = self._routes.beat(now_s)
+                self._send_all(outgoing)
+                self._tell_refused(now_s)
+            self._receive()
+
+    def _receive(self) -> None:
+        """Deliver what comes until nothing has come for a moment."""
+        for _ in range(_MOST_AT_ONCE):
+            try:
+                datagram, source = self._socket.recvfrom(_BUFFER_BYTES)
+            except OSError:  # nothing has come, or a former datagram did not arrive
+                return
+            with self._lock:
+                taken = self._routes.take(datagram, (source[0], source[1]), time.monotonic())
+            self._send_all(taken.outgoing)
+            for key, payload in taken.messages:
+                self._publish(_PREFIX + key, payload)
+
+    def _publish(self, key: str, payload: bytes) -> None:
+        publisher = self._publishers.get(key)
+        with contextlib.suppress(zenoh.ZError):
+            if publisher is None:
+                if len(self._publishers) >= _MOST_PUBLISHERS:
+                    self._publishers.pop(next(iter(self._publishers))).undeclare()
+                publisher = self._publishers[key] = self._session.declare_publisher(
+                    key,
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    reliability=zenoh.Reliability.BEST_EFFORT,
+                )
+            publisher.put(payload)
+
+    def _tell_refused(self, now_s: float) -> None:
+        refused = self._routes.refused.total()
+        if refused > self._told and now_s - self._told_s > _TOLD_EVERY_S:
+            self._told, self._told_s = refused, now_s
+            counts = ", ".join(f"{count} {reason}" for reason, count in self._routes.refused.most_common())
+            print(f"datagrams refused so far: {counts}", file=sys.stderr, flush=True)
+
+
+def bind_datagrams(identity: OwnIdentity) -> socket.socket:
+    """Return a socket at the address of an identity; at any port where it has none.
+
+    Raises:
+        StartError: the port is taken, or the address is not of this computer.
+    """
+    addresses = _addresses(identity)
+    own, known = addresses.get(identity.name), next(iter(addresses.values()))
+    version = ipaddress.ip_address((own or known)[0]).version
+    sock = socket.socket(socket.AF_INET6 if version == 6 else socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        sock.bind(own or ("::" if version == 6 else "0.0.0.0", 0))
+    except OSError as error:
+        sock.close()
+        where = " port ".join(map(str, own or ()))
+        raise StartError(
+            f"datagrams at {where}: {error.strerror}. It is the port after that of the host's address in [[hosts]]; "
+            "use another address, or end what uses the port"
+        ) from error
+    sock.settimeout(_WAKE_S)
+    return sock
+
+
+def _addresses(identity: OwnIdentity) -> dict[str, Address]:
+    return {one.name: datagram_address(one.address) for one in identity.roster.speakers if one.address}
