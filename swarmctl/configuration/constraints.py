@@ -24,6 +24,7 @@ from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.transport import Endpoint, parse_url
 
 _PAIRS_SHOWN = 3
+_HEARTBEATS = 4  # within the time after which a peer counts as silent: three may be missed in succession
 _LEAST_FAR_HZ = 5.0  # a bus on which several are not heard for 0.3 s is lost
 
 
@@ -41,7 +42,13 @@ def own_controller_problems(
 
 
 def path_sharing_problems(sharing: PathSharingParams, separation: SeparationParams) -> Iterator[str]:
-    """Yield what does not go with paths that only peers within reach hear all of."""
+    """Yield which paths peers would hear too seldom, or which only peers within reach would hear all of."""
+    longest_s = separation.lost_after_s / _HEARTBEATS
+    if sharing.error_m and sharing.heartbeat_s > longest_s:
+        yield (
+            f"agent.path_sharing.heartbeat_s = {sharing.heartbeat_s:g}: largest allowed: {longest_s:g}, a quarter of "
+            "separation.lost_after_s; with longer ones a few lost messages make a peer count as silent"
+        )
     if 0.0 < sharing.far_hz < _LEAST_FAR_HZ:
         yield (
             f"agent.path_sharing.far_hz = {sharing.far_hz:g}: allowed: 0, or {_LEAST_FAR_HZ:g} to 25; peers heard less "

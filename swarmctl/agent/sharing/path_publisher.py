@@ -9,7 +9,6 @@ from swarmctl.agent.ports import Ports
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.sharing.path_sharing import PathSharing
 from swarmctl.bus import topics
-from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.constant_velocity import (
     StopJudge,
@@ -72,10 +71,9 @@ class PathPublisher:
             return
         margin_m = sum((*margins_m, self._gust.margin_m))
         topic = self._topic()
-        path = self._sharing.choose(self._path(state, flown, seq, margin_m), always=topic is topics.FAR_PATH)
-        if path is not None:
-            compact = topic is topics.FAR_PATH or self._setup.params.path_sharing.compact
-            self._ports.bus.publish(topic, encode_path(path, compact=compact))
+        message = self._sharing.message(self._path(state, flown, seq, margin_m), for_all=topic is topics.FAR_PATH)
+        if message is not None:
+            self._ports.bus.publish(topic, message)
 
     def _is_recent(self, state: VehicleState) -> bool:
         """Return whether a state may be continued: peers could not tell that a path from it is older than it says."""

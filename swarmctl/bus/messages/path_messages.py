@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import struct
+from functools import lru_cache
 
 import numpy as np
 
@@ -131,7 +132,16 @@ def _compact_points(body: bytes, count: int, exponent: int) -> Array | None:
     units = np.empty((count, 3))
     units[:2] = np.frombuffer(body, _BEGIN, 6).reshape(2, 3)
     units[2:] = np.frombuffer(body, _BEND, offset=_BEGIN_BYTES).reshape(-1, 3)
-    np.cumsum(units[1:], axis=0, out=units[1:])  # whole numbers below 2^53, so that sums are exact
-    np.cumsum(units, axis=0, out=units)
-    units *= 2.0**exponent
-    return units
+    found: Array = _summing(count) @ units  # whole numbers below 2^53, so that sums are exact
+    found *= 2.0**exponent
+    return found
+
+
+@lru_cache(maxsize=8)
+def _summing(count: int) -> Array:
+    """Return what makes points of the first one, the first step and `count - 2` bends: (count, count), read-only."""
+    k = np.arange(count, dtype=np.float64)
+    found = np.maximum(k[:, None] - k + 1.0, 0.0)  # a bend is in every later step
+    found[:, 0], found[:, 1] = 1.0, k
+    found.flags.writeable = False
+    return found

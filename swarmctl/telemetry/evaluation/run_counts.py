@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.bus.silence import REOPENED
+from swarmctl.bus.topics import FAR_PATH, PATH
 from swarmctl.core.types import Array, Mode, PlanStatus
 from swarmctl.telemetry.evaluation.reception import unresponsive
 from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.json_safe import finite
 
 _CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
+_PATHS, _COUNTED = (PATH.name, FAR_PATH.name), ("messages", "bytes")
 _SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
 
 
@@ -44,6 +46,7 @@ def communication(
     return {
         "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
         "sent": _sent(events),
+        "sent_by": _sent_by(events),
         "rejected": _refused(events, "bus_summary", "rejected"),
         "refused_frames": _refused(events, "link_summary", "refused"),
         "unresponsive": unresponsive(events, time_field),
@@ -59,12 +62,28 @@ def _sent(events: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
     """Add up messages and bytes by topic in the last summary of each agent."""
     total: dict[str, Counter[str]] = {}
     for summary in _last_of_each_source(events, "bus_summary"):
-        topics = summary.get("sent")
-        for topic, counts in topics.items() if isinstance(topics, dict) else ():
-            if isinstance(counts, dict):
-                found = {key: int(counts[key]) for key in ("messages", "bytes") if finite(counts.get(key)) is not None}
-                total.setdefault(str(topic), Counter()).update(found)
+        for topic, found in _topics_of(summary):
+            total.setdefault(topic, Counter()).update(found)
     return {topic: dict(counts) for topic, counts in sorted(total.items())}
+
+
+def _sent_by(events: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+    """Add up messages and bytes of all topics in the last summary of each agent, and the bytes of predicted paths."""
+    found: dict[str, dict[str, int]] = {}
+    for summary in _last_of_each_source(events, "bus_summary"):
+        topics = dict(_topics_of(summary))
+        paths = sum(topics[name].get("bytes", 0) for name in _PATHS if name in topics)
+        total = {key: sum(counts.get(key, 0) for counts in topics.values()) for key in _COUNTED}
+        found[str(summary.get("source"))] = total | {"path_bytes": paths}
+    return dict(sorted(found.items()))
+
+
+def _topics_of(summary: Mapping[str, Any]) -> Iterable[tuple[str, dict[str, int]]]:
+    """Yield `messages` and `bytes` of each topic in a summary, as far as they are numbers."""
+    topics = summary.get("sent")
+    for topic, counts in topics.items() if isinstance(topics, dict) else ():
+        if isinstance(counts, dict):
+            yield str(topic), {key: int(counts[key]) for key in _COUNTED if finite(counts.get(key)) is not None}
 
 
 def _refused(events: Sequence[Mapping[str, Any]], name: str, field: str) -> dict[str, int]:

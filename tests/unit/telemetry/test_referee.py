@@ -441,7 +441,12 @@ def test_refused_messages_are_summed_over_each_agents_last_summary() -> None:
     events = [
         {"source": "agent-0", "event": "bus_summary", "rejected": {"stale": 1}},
         {"source": "agent-0", "event": "bus_summary", "rejected": {"stale": 3, "identity": 1}, "sent": sent(2, 900)},
-        {"source": "agent-1", "event": "bus_summary", "rejected": {"stale": 4}, "sent": sent(1, 100)},
+        {
+            "source": "agent-1",
+            "event": "bus_summary",
+            "rejected": {"stale": 4},
+            "sent": sent(1, 100) | {"far_path": {"messages": 2, "bytes": 30}, "tick": {"messages": 9, "bytes": 7000}},
+        },
         {"source": "agent-1", "event": "other", "rejected": {"stale": 100}},
         {"source": "agent-0", "event": "link_summary", "refused": {"unsigned": 2}},
         {"source": "agent-1", "event": "link_summary", "refused": {"unsigned": 3, "old": 1}},
@@ -449,7 +454,12 @@ def test_refused_messages_are_summed_over_each_agents_last_summary() -> None:
     comms = evaluate(run(APART, events=events), Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
     assert comms["path_age_ms"] == {"p50": 30.0, "p99": 30.0}
     assert comms["rejected"] == {"identity": 1, "stale": 7}
-    assert comms["sent"] == sent(3, 1000), "of all agents"
+    assert comms["sent"]["path"] == sent(3, 1000)["path"], "of all agents"
+    assert comms["sent"]["tick"] == {"messages": 9, "bytes": 7000}
+    assert comms["sent_by"] == {
+        "agent-0": {"messages": 2, "bytes": 900, "path_bytes": 900},
+        "agent-1": {"messages": 12, "bytes": 7130, "path_bytes": 130},
+    }
     assert comms["refused_frames"] == {"old": 1, "unsigned": 5}
 
 
@@ -620,4 +630,12 @@ def test_summary_holds_no_nan_and_every_contract_key(data: RunData) -> None:
     assert set(again["obstacles"]) == {"min_clearance_m", "required_m"}
     assert set(again["timing"]) == {"ticks", "due_ticks", "late_ticks", "tick_ms", "solve_ms", "speed_factor"}
     assert set(again["solver"]) >= {"name", "failed", "max_residual_m"}
-    assert set(again["comms"]) == {"path_age_ms", "sent", "rejected", "refused_frames", "unresponsive", "reopened"}
+    assert set(again["comms"]) == {
+        "path_age_ms",
+        "sent",
+        "sent_by",
+        "rejected",
+        "refused_frames",
+        "unresponsive",
+        "reopened",
+    }
