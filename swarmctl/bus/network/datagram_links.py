@@ -32,6 +32,8 @@ _BUFFER_BYTES = 1 << 20
 _MOST_AT_ONCE = 256  # datagrams that are taken between two beats
 _TOLD_EVERY_S = 10.0
 _MOST_PUBLISHERS = 1024
+_MOST_WAITING = 256  # messages of one topic that wait to be sent; the oldest gives way
+_CLOSE_S = 1.0
 
 
 def datagram_address(address: str) -> Address:
@@ -54,33 +56,46 @@ class DatagramLinks:
         addresses, number = _addresses(identity), secrets.randbits(64) or 1
         self._session, self._socket = session, sock
         self._routes = DatagramRoutes(identity.roster, identity.name, keys, addresses, session=number)
-        self._lock = threading.Lock()  # Zenoh's threads send, the own one receives
+        self._lock = threading.Lock()  # several threads send, one receives
         self._publishers: dict[str, Any] = {}
         self._ends = threading.Event()
         self._told_s, self._told = time.monotonic(), 0
         self._subscribers = [
             session.declare_subscriber(
                 f"{_PREFIX}*/*/{topic.name}",
-                zenoh.handlers.Callback(self._send, indirect=False),
+                zenoh.handlers.RingChannel(_MOST_WAITING),
                 allowed_origin=zenoh.Locality.REMOTE,
             )
             for topic in TOPICS
             if not topic.reliable
         ]
-        self._thread = threading.Thread(target=self._run, name="datagrams", daemon=True)
-        self._thread.start()
+        self._threads = [threading.Thread(target=self._run, name="datagrams", daemon=True)] + [
+            threading.Thread(target=self._send_from, args=(subscriber,), name="datagrams sent", daemon=True)
+            for subscriber in self._subscribers
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def close(self) -> None:
         """Send and receive nothing from now on."""
         self._ends.set()
-        self._thread.join()
         for subscriber in self._subscribers:
             with contextlib.suppress(zenoh.ZError):
                 subscriber.undeclare()
+        for thread in self._threads:
+            thread.join(_CLOSE_S)
         self._socket.close()
 
+    def _send_from(self, subscriber: Any) -> None:
+        """Send what clients publish on one topic; the newest, where they publish faster than that."""
+        while not self._ends.is_set():
+            try:
+                sample = subscriber.recv()
+            except zenoh.ZError:
+                return  # undeclared
+            self._send(sample)
+
     def _send(self, sample: Any) -> None:
-        """Send what a client has published."""
         key = str(sample.key_expr).removeprefix(_PREFIX)
         with self._lock:
             outgoing = self._routes.send(key, sample.payload.to_bytes(), time.monotonic())

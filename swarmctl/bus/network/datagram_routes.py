@@ -1,8 +1,8 @@
 """Which datagrams carry the messages of one computer to the others, and what is delivered of theirs. Pure.
 
-Every computer tells every other one, ten times a second, whom it hears. Who does not hear this one directly is also sent
-what it says by a third computer that is heard by this one and hears both, where the roster allows relays; the third one
-can't read it.
+Every computer tells every other one, ten times a second, whom it hears. Who does not hear this one directly is also
+sent what it says by a third computer that is heard by this one and hears both, where the roster allows relays; the
+third one can't read it.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class DatagramRoutes:
     def _message(self, link: _Link, body: bytes) -> Taken:
         key_end = _KEY_LENGTH.size + body[0] if body else 0
         key, payload = body[_KEY_LENGTH.size : key_end].decode("ascii", "replace"), body[key_end:]
-        run, sender, name = (key.split("/") + ["", "", ""])[:3] if key.count("/") == 2 else ("", "", "")
+        run, sender, name = key.split("/") if key.count("/") == 2 else ("", "", "")
         topic = _BY_NAME.get(name)
         if topic is None or not _RUN.fullmatch(run) or len(body) < key_end:
             return self._refuse(MALFORMED)

@@ -48,7 +48,9 @@ def host_problems(hosts: Sequence[HostParams], agents: int) -> Iterator[str]:
 
 def _clashes(hosts: Sequence[HostParams]) -> Iterator[str]:
     """Yield where datagrams, which go to the port after that of an address, would meet something else."""
-    places = {(ip_of(host.address), _port(host.address)): host.name for host in hosts if not _address_problem(host.address)}
+    places = {
+        (ip_of(host.address), _port(host.address)): host.name for host in hosts if not _address_problem(host.address)
+    }
     for (ip, port), name in places.items():
         if other := places.get((ip, port + 1)):
             yield f"hosts: port {port + 1} of {ip} is {other}'s and that of datagrams to {name}; leave one port between"

@@ -30,7 +30,10 @@ class Pair:
     """Two computers that share a key; both know the other's session unless they have not met."""
 
     def __init__(self, *, met: bool = True) -> None:
-        self.a, self.b = DatagramChannel(KEY, me=0, other=1, session=11), DatagramChannel(KEY, me=1, other=0, session=22)
+        self.a, self.b = (
+            DatagramChannel(KEY, me=0, other=1, session=11),
+            DatagramChannel(KEY, me=1, other=0, session=22),
+        )
         if met:
             assert self.b.open(self.a.seal(b"hello")).wants_answer
             assert self.a.open(self.b.seal(b"hello", answer=True)).body == b"hello"
@@ -237,7 +240,11 @@ def test_a_stranger_s_datagrams_are_counted_and_passed_on_to_nobody() -> None:
     net = Net()
     net.beat()
     stranger = DatagramChannel(OTHER_KEY, me=0, other=1, session=5)
-    for datagram in (b"junk", stranger.seal(b"x" * 20), DatagramChannel(OTHER_KEY, me=0, other=60, session=5).seal(b"x")):
+    for datagram in (
+        b"junk",
+        stranger.seal(b"x" * 20),
+        DatagramChannel(OTHER_KEY, me=0, other=60, session=5).seal(b"x"),
+    ):
         taken = net.at["bravo"].take(datagram, ("10.0.0.66", 1), net.now_s)
         assert (taken.messages, taken.outgoing) == ((), [])
     assert net.at["bravo"].refused == Counter({MALFORMED: 1, FORGED: 2})
