@@ -11,7 +11,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from swarmctl.bus.network.datagrams import (
     MOST_DATAGRAM_BYTES,
@@ -140,7 +140,9 @@ class DatagramRoutes:
         if opened.refused:
             return self._refuse(opened.refused)
         if opened.wants_answer:
-            return Taken(outgoing=self._answer(link, source, now_s))
+            at = link.address if link.is_fixed or opened.relayed else source
+            beat = _BODY.pack(_BEAT, self._mask(now_s))
+            return Taken(outgoing=self._to(route.sender, replace(link, address=at), beat, now_s, answer=True))
         if not (opened.relayed or link.is_fixed):
             link.address = source
         return self._believe(route, link, opened.body, opened.relayed, now_s)
@@ -178,21 +180,16 @@ class DatagramRoutes:
             return self._refuse(FORGED)
         return Taken(outgoing=[] if to.address is None else [(inner, to.address)])
 
-    def _answer(self, link: _Link, source: Address, now_s: float) -> Outgoing:
-        body = _BODY.pack(_BEAT, self._mask(now_s))
-        return [(link.channel.seal(body, answer=True), link.address if link.is_fixed and link.address else source)]
-
-    def _to(self, place: int, link: _Link, body: bytes, now_s: float) -> Outgoing:
+    def _to(self, place: int, link: _Link, body: bytes, now_s: float, *, answer: bool = False) -> Outgoing:
         """Return the datagrams that bring a body to another computer: directly, and by a third one if need be."""
         found = Outgoing()
         if link.address is not None:
-            found.append((link.channel.seal(body), link.address))
+            found.append((link.channel.seal(body, answer=answer), link.address))
         hears_me = bool(link.mask >> self._me & 1) and now_s - link.told_s < HEARD_S
-        if link.channel.is_open and not hears_me and (third := self._third(place, now_s)) is not None:
-            inner = link.channel.seal(body, relayed=True)
-            outer = _BODY.pack(_FOR_ANOTHER, self._mask(now_s)) + inner
-            if third.address is not None:
-                found.append((third.channel.seal(outer), third.address))
+        third = None if hears_me else self._third(place, now_s)
+        if third is not None and third.address is not None:
+            inner = link.channel.seal(body, relayed=True, answer=answer)
+            found.append((third.channel.seal(_BODY.pack(_FOR_ANOTHER, self._mask(now_s)) + inner), third.address))
         return found
 
     def _third(self, place: int, now_s: float) -> _Link | None:

@@ -116,7 +116,7 @@ class DatagramChannel:
             return Opened(refused=FORGED)
         if named != self._session:
             self._learnt = session
-            return Opened(wants_answer=True)
+            return Opened(wants_answer=True, relayed=bool(relayed))
         if not is_known:
             self._begin(session, cipher)
         if not self._is_new(number):

@@ -117,6 +117,7 @@ class Net:
         self.roster, self.now_s = roster_of(HOSTS, relay=relay), 100.0
         self._pairs = {frozenset(pair): bytes((i,)) * 32 for i, pair in enumerate(combinations(self.roster.names, 2))}
         self.loses: Callable[[str, str], bool] = lambda _a, _b: False
+        self.station = STATION_ADDRESS
         self.got: dict[str, list[tuple[str, bytes]]] = {}
         self.sent: list[tuple[str, str, bytes]] = []
         self.at = {name: self.new(name, number) for number, name in enumerate(self.roster.names, 1)}
@@ -127,10 +128,12 @@ class Net:
 
     def carry(self, name: str, outgoing: list[tuple[bytes, tuple[str, int]]]) -> None:
         """Carry datagrams, and those that answer them."""
-        where = {STATION_ADDRESS: STATION} | {address: host for host, address in ADDRESSES.items()}
-        source = ADDRESSES.get(name, STATION_ADDRESS)
+        where = {self.station: STATION} | {address: host for host, address in ADDRESSES.items()}
+        source = ADDRESSES.get(name, self.station)
         for datagram, address in outgoing:
-            to = where[address]
+            to = where.get(address, "nobody")
+            if to == "nobody":
+                continue
             self.sent.append((name, to, datagram))
             if not self.loses(name, to):
                 taken = self.at[to].take(datagram, source, self.now_s)
@@ -186,6 +189,15 @@ def test_a_third_computer_passes_on_what_a_cut_link_does_not_carry(relay: bool, 
     assert len(net.sent) == 3, "directly again"
 
 
+@pytest.mark.parametrize("relay", [True, False])
+def test_two_that_have_never_heard_each_other_meet_by_a_third_one(relay: bool) -> None:
+    net = Net(relay=relay)
+    net.loses = lambda a, b: {a, b} == {"alpha", "bravo"}
+    net.beat(round(2 * HEARD_S / BEAT_S))
+    assert net.say("alpha", PATH.format(0)).get("bravo", 0) == int(relay)
+    assert net.say("bravo", PATH.format(1)).get("alpha", 0) == int(relay)
+
+
 def test_who_passes_on_can_not_read_it() -> None:
     net = Net()
     net.beat()
@@ -213,6 +225,15 @@ def test_the_station_is_told_where_it_was_heard_and_nothing_once_it_is_gone() ->
     net.sent.clear()
     net.say("alpha", PATH.format(0))
     assert STATION not in {to for _, to, _ in net.sent}
+
+
+def test_a_station_that_is_started_again_elsewhere_is_told_there() -> None:
+    net = Net()
+    net.beat()
+    net.at[STATION] = net.new(STATION, 88)
+    net.station = ("10.0.0.10", 50_001)
+    net.beat()
+    assert net.say("alpha", TICK.format(0)) == {STATION: 1}
 
 
 def test_half_of_all_datagrams_lost_leaves_half_of_the_messages() -> None:
