@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 from collections import Counter
 from collections.abc import Callable
 from itertools import combinations
@@ -196,6 +197,30 @@ def test_two_that_have_never_heard_each_other_meet_by_a_third_one(relay: bool) -
     net.beat(round(2 * HEARD_S / BEAT_S))
     assert net.say("alpha", PATH.format(0)).get("bravo", 0) == int(relay)
     assert net.say("bravo", PATH.format(1)).get("alpha", 0) == int(relay)
+
+
+@pytest.mark.parametrize(
+    ("relay", "inner_from", "passed_on"), [(True, 0, 1), (True, 1, 0), (False, 0, 0)], ids=["", "of another", "off"]
+)
+def test_what_is_passed_on_is_of_who_asks_for_it(relay: bool, inner_from: int, passed_on: int) -> None:
+    """Alpha asks charlie to pass a datagram on to bravo."""
+    net = Net(relay=relay)
+    net.beat()
+    inner = DatagramChannel(KEY, me=inner_from, other=1, session=5).seal(b"x")
+    asked = net.at["alpha"]._links[2].channel.seal(struct.pack("<BQ", 2, 0) + inner)
+    taken = net.at["charlie"].take(asked, ADDRESSES["alpha"], net.now_s)
+    assert taken.outgoing == [(inner, ADDRESSES["bravo"])] * passed_on
+    assert net.at["charlie"].refused.total() == 1 - passed_on
+
+
+def test_nobody_is_asked_to_pass_anything_on_where_that_is_off() -> None:
+    net = Net(relay=False)
+    net.beat()
+    net.loses = lambda a, b: {a, b} == {"alpha", "bravo"}
+    net.beat(round(2 * HEARD_S / BEAT_S))
+    net.sent.clear()
+    net.say("alpha", PATH.format(0))
+    assert sorted(to for _, to, _ in net.sent) == ["bravo", "charlie", STATION]
 
 
 def test_who_passes_on_can_not_read_it() -> None:
