@@ -227,7 +227,9 @@ def _join(
 ) -> _Joined:
     """Open a session and declare everything."""
     session = _open_client(endpoint, lease_ms, connect_timeout_ms)
-    publishers = {topic: _publisher(session, f"{prefix}/{me}/{topic.name}", topic) for topic in TOPICS}
+    publishers = {
+        topic: declare_publisher(session, f"{prefix}/{me}/{topic.name}", reliable=topic.reliable) for topic in TOPICS
+    }
     subscribers = {
         topic: {sender: _subscriber(session, f"{prefix}/{sender}/{topic.name}", topic) for sender in senders}
         for topic, senders in dict(subscriptions).items()
@@ -242,8 +244,9 @@ def _join(
     )
 
 
-def _publisher(session: Any, key: str, topic: Topic) -> Any:
-    reliability = zenoh.Reliability.RELIABLE if topic.reliable else zenoh.Reliability.BEST_EFFORT
+def declare_publisher(session: Any, key: str, *, reliable: bool) -> Any:
+    """Return a publisher whose messages are dropped where the queue is full."""
+    reliability = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
     return session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP, reliability=reliability)
 
 

@@ -21,9 +21,10 @@ from typing import Any
 import zenoh
 
 from swarmctl.bus.network.datagram_routes import BEAT_S, Address, DatagramRoutes, Outgoing
-from swarmctl.bus.network.roster import OwnIdentity
+from swarmctl.bus.network.roster import OwnIdentity, split_address
 from swarmctl.bus.network.seals import PairKeys
 from swarmctl.bus.topics import TOPICS
+from swarmctl.bus.zenoh_bus import declare_publisher
 from swarmctl.errors import StartError
 
 _PREFIX = "swarm/"
@@ -38,8 +39,8 @@ _CLOSE_S = 1.0
 
 def datagram_address(address: str) -> Address:
     """Return where the datagrams to a router go that is at `IP:PORT`: to the next port."""
-    ip, _, port = address.rpartition(":")
-    return ip.removeprefix("[").removesuffix("]"), int(port) + 1
+    ip, port = split_address(address)
+    return str(ip), port + 1
 
 
 class DatagramLinks:
@@ -137,11 +138,7 @@ class DatagramLinks:
             if publisher is None:
                 if len(self._publishers) >= _MOST_PUBLISHERS:
                     self._publishers.pop(next(iter(self._publishers))).undeclare()
-                publisher = self._publishers[key] = self._session.declare_publisher(
-                    key,
-                    congestion_control=zenoh.CongestionControl.DROP,
-                    reliability=zenoh.Reliability.BEST_EFFORT,
-                )
+                publisher = self._publishers[key] = declare_publisher(self._session, key, reliable=False)
             publisher.put(payload)
 
     def _tell_refused(self, now_s: float) -> None:

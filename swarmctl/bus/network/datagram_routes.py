@@ -11,7 +11,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from swarmctl.bus.network.datagrams import (
     MOST_DATAGRAM_BYTES,
@@ -23,21 +23,19 @@ from swarmctl.bus.network.datagrams import (
 from swarmctl.bus.network.roster import Roster
 from swarmctl.bus.network.seals import PairKeys, overhead_bytes
 from swarmctl.bus.refusals import FORGED, MALFORMED
-from swarmctl.bus.topics import TOPICS
+from swarmctl.bus.topics import TICK, TOPICS
 
 BEAT_S = 0.1
 HEARD_S = 0.5  # a computer of which nothing has come for so long is not heard
 GONE_S = 5.0  # the station, silent for so long, is told nothing until it is heard again
-MOST_SPEAKERS = 64  # of a roster: bits of a mask
 TOO_LONG_TO_SEND = "too_long_to_send"  # by a client of this computer
-_BODY = struct.Struct("<BQ")  # kind, mask of who is heard directly
+_BODY = struct.Struct("<BQ")  # kind, mask of who is heard directly: a bit for each of MOST_HOSTS and the station
 _BEAT, _MESSAGE, _FOR_ANOTHER = 0, 1, 2
-_KEY_LENGTH = struct.Struct("<B")
 _RUN = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 _BY_NAME = {topic.name: topic for topic in TOPICS if not topic.reliable}
-_FOR_STATIONS_ONLY = frozenset(("tick",))
+_FOR_STATIONS_ONLY = frozenset((TICK.name,))
 # A message is passed on in the body of another datagram
-_MOST_BODY_BYTES = MOST_DATAGRAM_BYTES - 2 * (OVERHEAD_BYTES + _BODY.size)
+_MOST_BODY_BYTES = MOST_DATAGRAM_BYTES - 2 * OVERHEAD_BYTES - _BODY.size
 
 Address = tuple[str, int]
 Outgoing = list[tuple[bytes, Address]]
@@ -107,19 +105,20 @@ class DatagramRoutes:
             payload: what is sent.
             now_s: monotonic time [s].
         """
-        _, sender, topic = key.split("/")
-        body = _KEY_LENGTH.pack(len(key.encode())) + key.encode() + payload
-        if sender not in self._own or topic not in _BY_NAME:
+        run, sender, topic = key.split("/")
+        if sender not in self._own or topic not in _BY_NAME or not _RUN.fullmatch(run):
             return []
+        name = key.encode()
+        body = _BODY.pack(_MESSAGE, self._mask(now_s)) + bytes((len(name),)) + name + payload
         if len(body) > _MOST_BODY_BYTES:
             self.refused[TOO_LONG_TO_SEND] += 1
             return []
-        mask, found = self._mask(now_s), Outgoing()
+        found = Outgoing()
         for place, link in self._links.items():
             if topic in _FOR_STATIONS_ONLY and not link.listens_to_ticks:
                 continue
             if link.channel.is_open and (link.is_fixed or now_s - link.told_s < GONE_S):
-                found += self._to(place, link, _BODY.pack(_MESSAGE, mask) + body, now_s)
+                found += self._to(place, link.address, body, now_s)
         return found
 
     def beat(self, now_s: float) -> Outgoing:
@@ -127,7 +126,7 @@ class DatagramRoutes:
         body = _BODY.pack(_BEAT, self._mask(now_s))
         found = Outgoing()
         for place, link in self._links.items():
-            found += self._to(place, link, body, now_s)
+            found += self._to(place, link.address, body, now_s)
         return found
 
     def take(self, datagram: bytes, source: Address, now_s: float) -> Taken:
@@ -142,7 +141,7 @@ class DatagramRoutes:
         if opened.wants_answer:
             at = link.address if link.is_fixed or opened.relayed else source
             beat = _BODY.pack(_BEAT, self._mask(now_s))
-            return Taken(outgoing=self._to(route.sender, replace(link, address=at), beat, now_s, answer=True))
+            return Taken(outgoing=self._to(route.sender, at, beat, now_s, answer=True))
         if not (opened.relayed or link.is_fixed):
             link.address = source
         return self._believe(route, link, opened.body, opened.relayed, now_s)
@@ -161,8 +160,8 @@ class DatagramRoutes:
         return Taken()
 
     def _message(self, link: _Link, body: bytes) -> Taken:
-        key_end = _KEY_LENGTH.size + body[0] if body else 0
-        key, payload = body[_KEY_LENGTH.size : key_end].decode("ascii", "replace"), body[key_end:]
+        key_end = 1 + body[0] if body else 0
+        key, payload = body[1:key_end].decode("ascii", "replace"), body[key_end:]
         run, sender, name = key.split("/") if key.count("/") == 2 else ("", "", "")
         topic = _BY_NAME.get(name)
         if topic is None or not _RUN.fullmatch(run) or len(body) < key_end:
@@ -180,11 +179,11 @@ class DatagramRoutes:
             return self._refuse(FORGED)
         return Taken(outgoing=[] if to.address is None else [(inner, to.address)])
 
-    def _to(self, place: int, link: _Link, body: bytes, now_s: float, *, answer: bool = False) -> Outgoing:
-        """Return the datagrams that bring a body to another computer: directly, and by a third one if need be."""
-        found = Outgoing()
-        if link.address is not None:
-            found.append((link.channel.seal(body, answer=answer), link.address))
+    def _to(self, place: int, address: Address | None, body: bytes, now_s: float, *, answer: bool = False) -> Outgoing:
+        """Return the datagrams that bring a body to another computer: to `address`, and by a third one if need be."""
+        link, found = self._links[place], Outgoing()
+        if address is not None:
+            found.append((link.channel.seal(body, answer=answer), address))
         hears_me = bool(link.mask >> self._me & 1) and now_s - link.told_s < HEARD_S
         third = None if hears_me else self._third(place, now_s)
         if third is not None and third.address is not None:

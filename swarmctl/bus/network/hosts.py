@@ -11,7 +11,7 @@ from pydantic import Field
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.network.identity_files import AUTHORITY, STATION
-from swarmctl.bus.network.roster import OwnIdentity, Roster, Speaker
+from swarmctl.bus.network.roster import MOST_HOSTS, OwnIdentity, Roster, Speaker, split_address
 from swarmctl.bus.network.router_links import RouterLinks
 from swarmctl.bus.topics import OPERATOR
 from swarmctl.core.params import Params
@@ -35,6 +35,8 @@ def host_problems(hosts: Sequence[HostParams], agents: int) -> Iterator[str]:
             yield f"hosts.{i}.name = {host.name!r}: reserved; choose another"
         if problem := _address_problem(host.address):
             yield f"hosts.{i}.address = {host.address!r}: {problem}; write IP:PORT, for example 192.168.1.20:7448"
+    if len(hosts) > MOST_HOSTS:
+        yield f"hosts: {len(hosts)} are listed; largest allowed: {MOST_HOSTS}; let several agents share a computer"
     yield from _clashes(hosts)
     for key, values in (("name", [h.name for h in hosts]), ("address", [h.address for h in hosts])):
         yield from (f"hosts: {key} {value!r} is given {n} times" for value, n in Counter(values).items() if n > 1)
@@ -48,9 +50,7 @@ def host_problems(hosts: Sequence[HostParams], agents: int) -> Iterator[str]:
 
 def _clashes(hosts: Sequence[HostParams]) -> Iterator[str]:
     """Yield where datagrams, which go to the port after that of an address, would meet something else."""
-    places = {
-        (ip_of(host.address), _port(host.address)): host.name for host in hosts if not _address_problem(host.address)
-    }
+    places = {split_address(host.address): host.name for host in hosts if not _address_problem(host.address)}
     for (ip, port), name in places.items():
         if other := places.get((ip, port + 1)):
             yield f"hosts: port {port + 1} of {ip} is {other}'s and that of datagrams to {name}; leave one port between"
@@ -91,19 +91,12 @@ def ip_of(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
     Raises:
         ValueError: it is not of this form.
     """
-    ip, _, port = address.rpartition(":")
-    if not port.isascii() or not port.isdigit() or not 0 < int(port) < 65535:
-        raise ValueError(f"{port!r} is no port from 1 to 65534")
-    return ipaddress.ip_address(ip.removeprefix("[").removesuffix("]"))
-
-
-def _port(address: str) -> int:
-    return int(address.rpartition(":")[2])
+    return split_address(address)[0]
 
 
 def _address_problem(address: str) -> str:
     try:
-        ip_of(address)
+        split_address(address)
     except ValueError as error:
         return str(error)
     return ""

@@ -7,8 +7,11 @@ they have ended.
 
 from __future__ import annotations
 
+import ipaddress
 import json
 from dataclasses import asdict, dataclass
+
+MOST_HOSTS = 63  # datagrams tell in 64 bits who is heard, the station included
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,3 +103,15 @@ def identity_of_json(text: str) -> OwnIdentity:
     )
     roster = Roster(speakers=speakers, relay=tree["roster"]["relay"])
     return OwnIdentity(folder=tree["folder"], name=tree["name"], roster=roster)
+
+
+def split_address(address: str) -> tuple[ipaddress.IPv4Address | ipaddress.IPv6Address, int]:
+    """Return IP and port of `IP:PORT`; IPv6 is in brackets, and the port has a next one, for datagrams.
+
+    Raises:
+        ValueError: it is not of this form.
+    """
+    ip, _, port = address.rpartition(":")
+    if not port.isascii() or not port.isdigit() or not 0 < int(port) < 65535:
+        raise ValueError(f"{port!r} is no port from 1 to 65534")
+    return ipaddress.ip_address(ip.removeprefix("[").removesuffix("]")), int(port)

@@ -163,6 +163,7 @@ def test_a_message_reaches_all_who_need_it_once() -> None:
     assert net.say("alpha", TICK.format(0)) == {STATION: 1}, "hosts have no use for it"
     assert net.say("alpha", "run/agent-0/command") == {}, "links carry what has to arrive"
     assert net.say("alpha", PATH.format(1)) == {}, "not its agent"
+    assert net.say("alpha", f"{'r' * 300}/agent-0/path") == {}, "no run has such a name"
 
 
 def test_nobody_speaks_for_an_agent_of_another_computer() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from cryptography.x509 import load_pem_x509_crl
 
-from swarmctl.bus.network.hosts import links_of
+from swarmctl.bus.network.hosts import HostParams, host_problems, links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.config import load, own_identity
@@ -63,6 +63,12 @@ def test_what_is_no_list_of_hosts_is_refused(item: str, words: str) -> None:
     with pytest.raises(ConfigError) as refused:
         load(CONFIG, [item])
     assert words in str(refused.value)
+
+
+def test_more_hosts_than_datagrams_can_tell_of_are_refused() -> None:
+    hosts = [HostParams(name=f"h{i}", address=f"10.0.0.{i + 1}:7448", agents=(i,)) for i in range(64)]
+    assert not list(host_problems(hosts[:63], 63))
+    assert any("largest allowed: 63" in problem for problem in host_problems(hosts, 64))
 
 
 def with_devices(*devices: str) -> list[str]:
