@@ -61,10 +61,10 @@ def test_negative_control_a_jump_that_is_believed_at_once_ends_in_a_collision(
 SHORT_JUMP_NED_M = (0.5, 0.0, 0.0)  # away from the other: drawn in, the vehicle comes that much closer
 
 
-def fly_beside_a_peer(fly: Fly, *sets: str) -> float:
+def fly_beside_a_peer(fly: Fly, *sets: str, until: Callable[[Lockstep], bool] | None = None) -> float:
     """Return the least true distance of two that hover 1.2 m apart, while both are in the air."""
     jump = {AT_S: lambda running: running.world.estimator.jump(0, np.array(SHORT_JUMP_NED_M))}
-    return separation_aloft_m(fly(*BESIDE, *sets, at=jump))
+    return separation_aloft_m(fly(*BESIDE, *sets, at=jump, until=until))
 
 
 @pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
@@ -76,4 +76,4 @@ def test_negative_control_a_jump_that_was_drawn_in_and_is_forgotten(fly: Fly, mo
     monkeypatch.setattr(
         LocalFrame, "drawn_ned_m", property(lambda self: local_frame._NOTHING, lambda self, _: None), raising=False
     )
-    assert fly_beside_a_peer(fly) < 0.75
+    assert fly_beside_a_peer(fly, until=closer_than(0.75)) < 0.75
