@@ -61,7 +61,7 @@ def test_negative_control_a_lost_position_that_is_believed_is_followed(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(autopilot, "_LOST_REPORTS", 1_000_000)
-    flight = fly_without_gps(fly, (*ALONE, *NOT_LANDED))
+    flight = fly_without_gps(fly, (*ALONE, *NOT_LANDED), until=mission_is_over)
     assert flight.outcomes == {"completed"}
     assert strayed_m(flight) > 5 * LANDED_M
 
