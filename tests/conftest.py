@@ -1,15 +1,17 @@
 """The order of the test files, the longest first, so that no worker idles at the end; and how each test begins.
 
-Hundreds of processes import the program: it is compiled once, whatever the environment says of keeping that.
+Hundreds of processes import the program: it is compiled once, whatever the environment says of keeping that. Workers
+begin to collect in different folders, because each loads what another has already rewritten and compiled.
 """
 
 from __future__ import annotations
 
 import compileall
+import gc
 import os
 import signal
 import sys
-from collections.abc import Iterator, Set
+from collections.abc import Generator, Iterator, Set
 from pathlib import Path
 
 import pytest
@@ -58,6 +60,31 @@ def pytest_configure(config: pytest.Config) -> None:
     sys.dont_write_bytecode = False  # this is for the tests themselves, whose rewriting is slower still
     for package in ("swarmctl", "sitl"):
         compileall.compile_dir(TESTS.parent / package, quiet=2)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Collect without the garbage collector: it would traverse, again and again, what is kept to the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+        gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Rotate what a folder contains, for each worker by another share; `order` makes them equal again."""
+    report = yield
+    worker = getattr(collector.config, "workerinput", None)
+    if worker is not None and isinstance(collector, pytest.Directory) and report.result:
+        number, workers = int(worker["workerid"].removeprefix("gw")), worker["workercount"]
+        first = number * len(report.result) // workers
+        report.result = report.result[first:] + report.result[:first]
+    return report
 
 
 @pytest.hookimpl(trylast=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +21,14 @@ TUBE_M = 0.5 * (COMMITTED_M - TOUCH_M)
 def flown(cell: Cell, seed: int = 1, **changes: Any) -> TrialFlight:
     """Fly the layout that the seed draws, with these changes of its fields."""
     flight = TrialFlight(Trial(cell, seed), replace(layout_of(cell.scenario, seed, cell.agents), **changes))
+    flight.run()
+    return flight
+
+
+def fly_until(flight: TrialFlight, shown: Callable[[TrialFlight], bool]) -> TrialFlight:
+    """Fly a trial until it has shown what it is flown for, at the longest to its end."""
+    over = flight._over
+    flight._over = lambda: shown(flight) or over()  # type: ignore[method-assign]
     flight.run()
     return flight
 

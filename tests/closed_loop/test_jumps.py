@@ -11,7 +11,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.mavlink.vehicle import local_frame
 from swarmctl.mavlink.vehicle.local_frame import LocalFrame
 from tests.closed_loop.conftest import Flight, Fly, closer_than
-from tests.closed_loop.test_lost_position import BESIDE, separation_aloft_m
+from tests.closed_loop.test_lost_position import BESIDE, one_is_down, separation_aloft_m
 
 JUMP_M = 5.0
 AT_S = 4.0  # mission time of the jump
@@ -61,19 +61,19 @@ def test_negative_control_a_jump_that_is_believed_at_once_ends_in_a_collision(
 SHORT_JUMP_NED_M = (0.5, 0.0, 0.0)  # away from the other: drawn in, the vehicle comes that much closer
 
 
-def fly_beside_a_peer(fly: Fly, *sets: str) -> float:
+def fly_beside_a_peer(fly: Fly, *sets: str, until: Callable[[Lockstep], bool] | None = None) -> float:
     """Return the least true distance of two that hover 1.2 m apart, while both are in the air."""
     jump = {AT_S: lambda running: running.world.estimator.jump(0, np.array(SHORT_JUMP_NED_M))}
-    return separation_aloft_m(fly(*BESIDE, *sets, at=jump))
+    return separation_aloft_m(fly(*BESIDE, *sets, at=jump, until=until))
 
 
 @pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
 def test_a_jump_that_has_been_drawn_in_is_still_allowed_for(fly: Fly, mode: str) -> None:
-    assert fly_beside_a_peer(fly, f"separation.mode={mode}") >= 0.85
+    assert fly_beside_a_peer(fly, f"separation.mode={mode}", until=one_is_down) >= 0.85
 
 
 def test_negative_control_a_jump_that_was_drawn_in_and_is_forgotten(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         LocalFrame, "drawn_ned_m", property(lambda self: local_frame._NOTHING, lambda self, _: None), raising=False
     )
-    assert fly_beside_a_peer(fly) < 0.75
+    assert fly_beside_a_peer(fly, until=closer_than(0.75)) < 0.75

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -10,13 +10,15 @@ import pytest
 from sitl.lockstep import Lockstep
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.control.estimation import accuracy
+from swarmctl.core.types import Landed
 from swarmctl.mavlink.vehicle import autopilot
-from tests.closed_loop.conftest import Flight, Fly
+from tests.closed_loop.conftest import Flight, Fly, closer_than, mission_is_over
 from tests.closed_loop.test_handover import COPTER
 
 AT_S = 3.0
 LANDED_M = 4.0  # from where it took off: lost 6 s, until the estimator has said so twice, and a blind descent
 SEPARATION_M = 0.85
+TOO_CLOSE_M = 0.6
 ENDED_S = 40.0  # start 14 s, loss 3 s, braking 4 s, landing 9 s; waiting for room lasts 20 s
 ALONE = ("swarm.agents=1", "mission.kind=hover", "mission.duration_s=60")
 # It drifts towards the peer 1.2 m away, who gives way by what the estimator has told by then.
@@ -30,14 +32,16 @@ GUARANTEED = ("separation.mode=guaranteed",)
 NOT_LANDED = ("agent.failsafe.dead_reckoning_land_s=60",)  # before its flags say that it has no position
 
 
-def fly_without_gps(fly: Fly, scene: Sequence[str] = ALONE, lost: int = 1) -> Flight:
+def fly_without_gps(
+    fly: Fly, scene: Sequence[str] = ALONE, lost: int = 1, until: Callable[[Lockstep], bool] | None = None
+) -> Flight:
     """Fly a scene in which so many vehicles, the first ones, lose GPS at once."""
 
     def lose(running: Lockstep) -> None:
         for vehicle in range(lost):
             running.world.estimator.lose_gps(vehicle)
 
-    return fly(*scene, at={AT_S: lose})
+    return fly(*scene, at={AT_S: lose}, until=until)
 
 
 def strayed_m(flight: Flight) -> float:
@@ -57,7 +61,7 @@ def test_negative_control_a_lost_position_that_is_believed_is_followed(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(autopilot, "_LOST_REPORTS", 1_000_000)
-    flight = fly_without_gps(fly, (*ALONE, *NOT_LANDED))
+    flight = fly_without_gps(fly, (*ALONE, *NOT_LANDED), until=mission_is_over)
     assert flight.outcomes == {"completed"}
     assert strayed_m(flight) > 5 * LANDED_M
 
@@ -76,13 +80,18 @@ def separation_aloft_m(flight: Flight) -> float:
     return float(np.linalg.norm(np.diff(flight.pos_ned_m[aloft, :2], axis=1), axis=2).min())
 
 
+def one_is_down(running: Lockstep) -> bool:
+    """No mission is under way, and one of the two has landed: what the other one does is not judged."""
+    return mission_is_over(running) and bool((running.world.truth_rows()["landed"] == Landed.ON_GROUND).any())
+
+
 @pytest.mark.parametrize(
     "landing",
     [(), NOT_LANDED, COPTER, GUARANTEED, (*GUARANTEED, *NOT_LANDED)],
     ids=["lands", "goes-on", "arducopter", "guaranteed-lands", "guaranteed-goes-on"],
 )
 def test_peers_keep_away_from_who_drifts(fly: Fly, landing: Sequence[str]) -> None:
-    flight = fly_without_gps(fly, (*BESIDE, *landing))
+    flight = fly_without_gps(fly, (*BESIDE, *landing), until=one_is_down)
     assert separation_aloft_m(flight) >= SEPARATION_M
     assert "completed" in flight.outcomes
 
@@ -91,7 +100,8 @@ def test_negative_control_who_drifts_comes_close_to_peers_that_are_not_told(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(accuracy, "_SIGMAS", 0.0)
-    assert separation_aloft_m(fly_without_gps(fly, (*BESIDE, *NOT_LANDED))) < 0.6
+    flight = fly_without_gps(fly, (*BESIDE, *NOT_LANDED), until=closer_than(TOO_CLOSE_M))
+    assert separation_aloft_m(flight) < TOO_CLOSE_M
 
 
 def test_negative_control_commitments_are_relied_on_whose_tube_leaves_out_the_estimate(
@@ -99,7 +109,8 @@ def test_negative_control_commitments_are_relied_on_whose_tube_leaves_out_the_es
 ) -> None:
     told = Coordination.publish
     monkeypatch.setattr(Coordination, "publish", lambda self, utc_us, *, unsure_m: told(self, utc_us, unsure_m=0.0))
-    assert separation_aloft_m(fly_without_gps(fly, (*BESIDE, *GUARANTEED, *NOT_LANDED))) < 0.6
+    flight = fly_without_gps(fly, (*BESIDE, *GUARANTEED, *NOT_LANDED), until=closer_than(TOO_CLOSE_M))
+    assert separation_aloft_m(flight) < TOO_CLOSE_M
 
 
 def test_all_who_have_lost_gps_land_soon_though_none_finds_room(fly: Fly) -> None:
