@@ -236,13 +236,15 @@ def test_a_token_has_come_once_however_many_processes_hold_it(join: Callable[...
 
 
 def test_one_that_left_and_came_back_between_two_looks_has_come_twice(join: Callable[..., ZenohBus]) -> None:
-    watcher, first = join("agent-0"), join("agent-1")
-    assert until(lambda: "agent-1" in watcher.alive())
+    watcher, witness, first = join("agent-0"), join("agent-2"), join("agent-1")
+    assert until(lambda: "agent-1" in watcher.alive() and "agent-1" in witness.alive())
     first.close()
+    assert until(lambda: "agent-1" not in witness.alive())
     join("agent-1")
-    time.sleep(0.5)
+    assert until(lambda: "agent-1" in witness.alive())
+    time.sleep(0.5)  # the watcher's session has most likely been told both by now
+    assert until(lambda: watcher.arrivals()["agent-1"] == 2)
     assert "agent-1" in watcher.alive()
-    assert watcher.arrivals()["agent-1"] == 2
 
 
 def test_a_closed_bus_is_silent_and_never_raises(join: Callable[..., ZenohBus]) -> None:
