@@ -1,13 +1,18 @@
-"""Real-time priority (SCHED_RR) for what flies: other programs then wait, and not setpoints or vehicle states."""
+"""Real-time priority (SCHED_RR) for what flies, and a low one for what only watches.
+
+Other programs then wait, and not setpoints or vehicle states.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import threading
 from pathlib import Path
 
 FLIGHT_PRIORITY = 10  # above every program of normal priority, below the kernel's own threads at 50
+WATCHER_NICE = 10  # a tenth of the processor time of a program of normal priority, where both want all of it
 
 
 def request_realtime(pid: int | None = None) -> bool:
@@ -42,6 +47,18 @@ def is_realtime_permitted() -> bool:
     asking.start()
     asking.join()
     return granted == [True]
+
+
+def give_way() -> None:
+    """Let this process, and all that it starts from now on, have the processor time that others leave.
+
+    Linux weighs sessions against each other where it groups processes by them (`autogroup`), and there the niceness of
+    a process counts within its session only.
+    """
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, WATCHER_NICE)
+    with contextlib.suppress(OSError):  # it is not Linux, or does not group
+        Path("/proc/self/autogroup").write_text(f"{WATCHER_NICE}", encoding="ascii")
 
 
 def _raise_priority(thread: int, priority: int = FLIGHT_PRIORITY) -> bool:

@@ -38,6 +38,7 @@ from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.agent.watches.controller_watch import ControllerWatch
 from swarmctl.agent.watches.deadline_watch import DeadlineWatch
 from swarmctl.agent.watches.vehicle_watch import VehicleWatch
+from swarmctl.control.failsafe.overload import Level
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
@@ -301,7 +302,11 @@ class Agent:
             disturbance_ned_m_s2=self._own_state.estimate.disturbance_ned_m_s2,
             margins_m=(jump_m, accuracy_m, self._deadlines.margin_m, self._planner.directive.margin_m),
         )
-        self._separation.publish(self._ports.clock.utc_us(), unsure_m=jump_m + accuracy_m)
+        self._separation.publish(
+            self._ports.clock.utc_us(),
+            unsure_m=jump_m + accuracy_m,
+            relays=self._deadlines.level is Level.NONE,
+        )
         self._interest.update(state, self._ports.clock.utc_us())
 
     def _advance(self, now_us: int, state: VehicleState | None) -> None:

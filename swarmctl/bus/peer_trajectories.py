@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 
 from swarmctl.bus.bus import agent_name
@@ -15,6 +16,7 @@ from swarmctl.core.trajectory_message import TrajectoryMessage
 
 MAX_BEGIN_US = 10_000_000  # from now; a trajectory that begins later comes from another clock
 MAX_CLOCK_ERROR_US = 10_000_000  # a clock known less well is known as badly; nothing is committed then
+_STAMPS = 64  # of messages of each peer that are kept; more than relays wait
 _BETTER_01 = 0.5  # share of the error of a clock at which trajectories are decoded anew
 
 
@@ -43,6 +45,7 @@ class PeerTrajectories:
         self._numbers = {agent_name(agent): agent for agent in self._verifiers}
         self._memory: dict[str, Memory] = {}
         self._used_error_us: dict[str, int] = {}  # of the clock of each peer, since its trajectories were decoded anew
+        self._stamps_us: dict[int, deque[int]] = {}  # of the last messages of each peer, oldest first
         self.newest: dict[int, TrajectoryMessage] = {}
         self.received_utc_us: dict[int, int] = {}  # when the newest message of each peer was accepted
         self.heard_before_flight: set[int] = set()  # peers that did not fly by commitments when first heard
@@ -65,6 +68,7 @@ class PeerTrajectories:
                 self.heard_before_flight.add(message.agent)
             self.newest[message.agent], self._memory[sender] = message, memory
             self.received_utc_us[message.agent] = utc_us
+            self._stamps_us.setdefault(message.agent, deque(maxlen=_STAMPS)).append(message.sent_utc_us)
             self._measure(message, utc_us)
             is_better = self._clocks.error_us(message.agent) < _BETTER_01 * self._used_error_us.get(sender, error_us)
             if self._clocks.ahead_us(message.agent) != ahead_us or is_better:
@@ -72,6 +76,15 @@ class PeerTrajectories:
                 self._used_error_us.pop(sender, None)
             else:
                 self._used_error_us.setdefault(sender, error_us)
+
+    def lacked_us(self, message: TrajectoryMessage, agent: int, stamp_us: int) -> int:
+        """Return how long before the sender of `message` sent it a peer sent its first message after a stamp.
+
+        Where that is forgotten it is the oldest one that is not.
+        """
+        first_us = next(stamp for stamp in self._stamps_us[agent] if stamp > stamp_us)
+        said_us = message.sent_utc_us - self._clocks.ahead_us(message.agent)
+        return said_us - (first_us - self._clocks.ahead_us(agent))
 
     def heard(self) -> dict[int, tuple[int, int]]:
         """Return stamp and arrival of the newest message of each peer."""

@@ -9,7 +9,8 @@ The layout is little-endian: a header, then for each message the number of its a
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from swarmctl.bus.bus import Bus, ForwardingBus, agent_name
 from swarmctl.bus.topics import RELAY, TOO_LONG, TRAJECTORY, Topic
@@ -18,6 +19,7 @@ from swarmctl.core.trajectory_message import TrajectoryMessage
 RELAY_VERSION = 1
 _RELAY_AFTER_PERIODS = 4  # without a message of the other one, after which a peer is helped: one or two get lost
 _HELPED_US = 3_000_000  # a peer that was itself not heard for this long is not
+_NEVER = (0, 0)  # stamp and arrival of the newest message of an agent that was never heard
 _MAGIC = b"SR"
 _HEADER = struct.Struct("<2sBB")  # magic, version, count
 _ENTRY = struct.Struct("<II")  # agent, length
@@ -97,26 +99,58 @@ class RelayingBus(ForwardingBus):
 
 
 def missed_by_peers(
-    newest: Mapping[int, TrajectoryMessage], utc_us: int, received_utc_us: Mapping[int, int], *, period_us: int
+    own: int,
+    newest: Mapping[int, TrajectoryMessage],
+    heard: Mapping[int, tuple[int, int]],
+    utc_us: int,
+    *,
+    period_us: int,
+    lacked_us: Callable[[TrajectoryMessage, int, int], int],
 ) -> list[int]:
-    """Return the agents whose newest message some peer lacks, having heard none of theirs for a while.
+    """Return the agents whose newest message this one has to pass on, since some peer has not heard them for a while.
 
-    Each peer says when, by its own clock, it has heard whom: neither delay nor clocks matter.
+    A peer is helped if, by its own clock, nothing of the other one has arrived for a while (however slow links are),
+    and what it lacks was sent a while before it said so (an agent that was held up itself is not missed).
+    Of all who have what it lacks, two help at once, those that it hears first. Each further pair waits two periods
+    longer, so that there is help whatever the first ones know, and messages do not grow with the number of agents:
+    helpers that all help at once keep each other from hearing in time, and so from ever ending it.
 
     Args:
+        own: number of this agent.
         newest: message of each peer.
+        heard: stamp of each peer's newest message and when it arrived here, as in its own message.
         utc_us: now.
-        received_utc_us: when each of them arrived.
         period_us: of every agent's messages.
+        lacked_us: returns for how long, by its newest message, a peer has lacked what another sent after a stamp.
     """
-    found = set[int]()
+    found, least_us = set[int](), _RELAY_AFTER_PERIODS * period_us
     for peer, message in newest.items():
-        if utc_us - received_utc_us[peer] > _HELPED_US:
+        if utc_us - heard[peer][1] > _HELPED_US:
             continue
         for agent, other in newest.items():
-            if agent == peer or agent in found:
+            stamp_us, arrival_us = message.heard.get(agent, _NEVER)
+            silent_us = message.sent_utc_us - arrival_us
+            if silent_us <= least_us or other.sent_utc_us <= stamp_us or agent == peer or agent in found:
                 continue
-            stamp_us, arrival_us = message.heard.get(agent, (0, 0))
-            if message.sent_utc_us - arrival_us > _RELAY_AFTER_PERIODS * period_us and other.sent_utc_us > stamp_us:
+            waited_us = min(silent_us, lacked_us(message, agent, stamp_us) + period_us)
+            if waited_us > least_us + 2 * period_us * (_rank(own, peer, agent, newest, least_us) // 2):
                 found.add(agent)
     return sorted(found)
+
+
+def _rank(own: int, peer: int, agent: int, newest: Mapping[int, TrajectoryMessage], least_us: int) -> int:
+    """Return how many others are to help a peer before this agent: they have what it lacks, and it hears them.
+
+    All come to the same order without a word, and to another one for each agent (rendezvous hashing, D. Thaler and
+    C. Ravishankar 1996).
+    """
+    message = newest[peer]
+    stamp_us = message.heard.get(agent, _NEVER)[0]
+
+    def order(helper: int) -> tuple[bool, int]:
+        is_heard = message.sent_utc_us - message.heard.get(helper, _NEVER)[1] <= least_us
+        return not is_heard, zlib.crc32(struct.pack("<II", helper, agent))
+
+    able = (i for i, said in newest.items() if i not in (peer, agent) and said.heard.get(agent, _NEVER)[0] > stamp_us)
+    own_order = order(own)
+    return sum(order(helper) < own_order for helper in able)

@@ -15,6 +15,13 @@ def policies(pid: int) -> set[int]:
     return {os.sched_getscheduler(int(task.name)) for task in Path(f"/proc/{pid}/task").iterdir()}
 
 
+def niceness(pid: int) -> set[int]:
+    """Niceness of all threads of a process, and of its session where the kernel weighs sessions."""
+    found = {os.getpriority(os.PRIO_PROCESS, int(task.name)) for task in Path(f"/proc/{pid}/task").iterdir()}
+    session = Path(f"/proc/{pid}/autogroup")  # "/autogroup-12 nice 0"
+    return found | ({int(session.read_text().split()[-1])} if session.exists() else set())
+
+
 @contextmanager
 def realtime_where_permitted(priority: int) -> Iterator[None]:
     """This thread, and what it starts meanwhile, has at least this real-time priority."""

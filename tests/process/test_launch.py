@@ -31,11 +31,11 @@ from swarmctl.ops.decide.inputs import frames_of
 from swarmctl.ops.decide.verb import decisions_of_run
 from swarmctl.ops.processes import wants_realtime
 from swarmctl.ops.running_launches import LAUNCH_FILE
-from swarmctl.process_priority import is_realtime_permitted
+from swarmctl.process_priority import WATCHER_NICE, is_realtime_permitted
 from swarmctl.telemetry.recording.run_files import read_parquet
 from tests.benches.at_once import at_once
 from tests.benches.launches import AIR, END_S, NEAR, TWO, GroundStation, Launched, Start
-from tests.benches.scheduling import policies
+from tests.benches.scheduling import niceness, policies
 from tests.process.test_readme import low, shown
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
@@ -57,6 +57,8 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
         assert policies(launched.pid_of(*words)) == {policy}, words
     viewer = launched.pid_of("swarmctl.telemetry.view.viewer")
     assert policies(viewer) == {os.SCHED_OTHER}, "it waits for those that fly"
+    assert niceness(viewer) == {WATCHER_NICE}, "also where these have no real-time priority"
+    assert niceness(launched.pid_of("agent", "--id", "0")) == {0}
     assert launched.verb("status").returncode == 0
     refused = launched.verb("report", str(launched.run_dir))
     assert (refused.returncode, refused.stdout) == (3, "")

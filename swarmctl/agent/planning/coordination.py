@@ -231,11 +231,12 @@ class Coordination:
         assert self._commitments.flown is not None
         return self._commitments.flown.sample(t_utc_us)
 
-    def publish(self, utc_us: int, *, unsure_m: float) -> None:
+    def publish(self, utc_us: int, *, unsure_m: float, relays: bool) -> None:
         """Apply rule 5: publish the own message, once there is a committed trajectory.
 
         Args:
             utc_us: now.
+            relays: pass on what peers lack of each other.
             unsure_m: by how much more the vehicle may be away from its estimate than distances leave room for. Peers
                 keep it from its path already; they do so while it may be outside its tube.
         """
@@ -257,8 +258,17 @@ class Coordination:
             heard=self._peer_trajectories.heard(),
         )
         self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
+        if not relays:
+            return
         peers = self._peer_trajectories
-        missed = missed_by_peers(peers.newest, utc_us, peers.received_utc_us, period_us=self._period_us)
+        missed = missed_by_peers(
+            self._agent,
+            peers.newest,
+            message.heard,
+            utc_us,
+            period_us=self._period_us,
+            lacked_us=peers.lacked_us,
+        )
         self._bus.relay(missed)
 
     @property

@@ -69,11 +69,12 @@ class SeparationPolicy(Protocol):
     def wait(self, utc_us: int, state: VehicleState | None) -> SeparationDirective:
         """Return the directive of a tick whose newest state, if there is any, is stale."""
 
-    def publish(self, utc_us: int, *, unsure_m: float) -> None:
+    def publish(self, utc_us: int, *, unsure_m: float, relays: bool) -> None:
         """Publish the messages that peers need for this policy.
 
         Args:
             utc_us: now.
+            relays: pass on what peers lack of each other, which an agent without time for it does not.
             unsure_m: by how much more the vehicle may be away from its estimate than distances leave room for.
         """
 
@@ -108,7 +109,7 @@ class BestEffort:
         """Ask for nothing: there is no plan."""
         return self.idle(utc_us, state, NO_KEEP_OUTS)
 
-    def publish(self, utc_us: int, *, unsure_m: float) -> None:
+    def publish(self, utc_us: int, *, unsure_m: float, relays: bool) -> None:
         """Do nothing: the agent publishes its path in every mode."""
 
 
@@ -174,6 +175,6 @@ class Guaranteed:
         self._coordination.wait(utc_us, state)
         return SeparationDirective(margin_m=self._coordination.margin_m)
 
-    def publish(self, utc_us: int, *, unsure_m: float) -> None:
+    def publish(self, utc_us: int, *, unsure_m: float, relays: bool) -> None:
         """Publish the committed trajectory, the proposal and the acknowledgements."""
-        self._coordination.publish(utc_us, unsure_m=unsure_m)
+        self._coordination.publish(utc_us, unsure_m=unsure_m, relays=relays)

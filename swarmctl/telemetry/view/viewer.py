@@ -1,8 +1,8 @@
 """The only process that uses rerun: reads ticks from the bus, serves a live view and writes `telemetry.rrd`.
 
-`python -m swarmctl.telemetry.view.viewer --run R --bus ENDPOINT --flight JSON --run-dir DIR`. It only serves, so it
-can't delay an agent; if it freezes or is killed, only the view is lost. The launcher ends it by SIGTERM (SIGHUP works
-as well when it was started by hand); it ignores Ctrl-C.
+`python -m swarmctl.telemetry.view.viewer --run R --bus ENDPOINT --flight JSON --run-dir DIR`. It only serves, and has the
+processor time that others leave, so it can't delay an agent; if it freezes or is killed, only the view is lost. The
+launcher ends it by SIGTERM (SIGHUP works as well when it was started by hand); it ignores Ctrl-C.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
 from swarmctl.files import replace_text
 from swarmctl.process_lifetime import StopRequest, die_with_parent
+from swarmctl.process_priority import give_way
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 from swarmctl.telemetry.view.recordings import APPLICATION, RECORDING, has_display, open_viewer
 from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_ports
@@ -39,6 +40,7 @@ _REDRAW_PERIOD_S = 5.0  # period of obstacles at rest, because the server's hist
 def main(arguments: list[str] | None = None) -> int:
     """Run until SIGTERM; returns the exit code."""
     options = _parser().parse_args(arguments)
+    give_way()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     stop = StopRequest(signal.SIGTERM, signal.SIGHUP)
     if options.die_with_parent:

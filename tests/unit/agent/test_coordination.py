@@ -88,7 +88,7 @@ class Bench:
             self.coordination.step(
                 utc_us, self.state, Phase.TRACK, DesiredReference(self.wanted), disturbance_ned_m_s2=np.zeros(3)
             )
-            self.coordination.publish(utc_us, unsure_m=0.0)
+            self.coordination.publish(utc_us, unsure_m=0.0, relays=True)
 
     def wanted(self, offsets_s: Array) -> tuple[Array, Array]:
         return np.tile(HERE, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
@@ -298,7 +298,7 @@ def test_an_encounter_with_who_does_not_take_part_is_measured_from_where_it_bega
 def test_an_agent_without_a_state_commits_nothing(bench: Bench) -> None:
     bench.fly(1.0, each=bench.send)
     bench.coordination.idle(bench.clock.utc_us(), None)
-    bench.coordination.publish(bench.clock.utc_us(), unsure_m=0.0)
+    bench.coordination.publish(bench.clock.utc_us(), unsure_m=0.0, relays=True)
     bench.clock.advance(20_000)
     *_, (_, payload) = bench.peer.receive(topics.TRAJECTORY)
     message = decode_trajectory_message(payload)

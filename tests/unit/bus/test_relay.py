@@ -105,10 +105,32 @@ def message(agent: int, *, sent_us: int, heard: dict[int, tuple[int, int]]) -> T
 
 
 NOW_US, PERIOD_US = 10_000_000, 20_000
+NEWEST_US = 9_990_000  # stamp of agent 2's newest message
+
+
+def missed(
+    heard: dict[int, tuple[int, int]],
+    *,
+    own: int = 0,
+    helpers: tuple[int, ...] = (),
+    received_us: int = NOW_US,
+    lacked_us: int = 1_000_000,
+    period_us: int = PERIOD_US,
+    ahead_us: int = 0,
+) -> list[int]:
+    """Return what `own` passes on to agent 1, which says of whom it has `heard`; all but agent 1 have heard agent 2."""
+    known = {agent: (NEWEST_US, NOW_US) for agent in (0, 1, 2, *helpers)}
+    newest = {
+        1: message(1, sent_us=NOW_US + ahead_us, heard=heard),
+        2: message(2, sent_us=NEWEST_US, heard={1: (NOW_US, NEWEST_US - 10_000)}),
+        **{helper: message(helper, sent_us=NEWEST_US, heard=known) for helper in helpers},
+    }
+    own_heard = {agent: (said.sent_utc_us, NOW_US) for agent, said in newest.items()} | {1: (NOW_US, received_us)}
+    return missed_by_peers(own, newest, own_heard, NOW_US, period_us=period_us, lacked_us=lambda *_: lacked_us)
 
 
 @pytest.mark.parametrize(
-    ("heard", "received_us", "missed"),
+    ("heard", "received_us", "found"),
     [
         ({2: (9_950_000, 9_960_000)}, NOW_US, []),
         ({2: (9_800_000, 9_810_000)}, NOW_US, [2]),
@@ -119,30 +141,57 @@ NOW_US, PERIOD_US = 10_000_000, 20_000
     ids=["heard lately", "not lately", "not lately, but there is nothing newer", "never", "itself silent"],
 )
 def test_who_is_missed_follows_from_what_peers_say_they_have_heard(
-    heard: dict[int, tuple[int, int]], received_us: int, missed: list[int]
+    heard: dict[int, tuple[int, int]], received_us: int, found: list[int]
 ) -> None:
     """Peer 1 says what it has heard of peer 2, whose newest message is of 9.99 s; peer 2 hears peer 1."""
-    newest = {
-        1: message(1, sent_us=NOW_US, heard=heard),
-        2: message(2, sent_us=9_990_000, heard={1: (NOW_US, 9_980_000)}),
-    }
-    assert missed_by_peers(newest, NOW_US, {1: received_us, 2: NOW_US}, period_us=PERIOD_US) == missed
+    assert missed(heard, received_us=received_us) == found
 
 
 def test_clocks_that_differ_by_hours_make_no_difference() -> None:
     hours_us = 3_600_000_000 * 5
-    newest = {
-        1: message(1, sent_us=NOW_US + hours_us, heard={2: (9_980_000, NOW_US + hours_us - 20_000)}),
-        2: message(2, sent_us=9_990_000, heard={1: (NOW_US + hours_us, 9_980_000)}),
-    }
-    assert missed_by_peers(newest, NOW_US, {1: NOW_US, 2: NOW_US}, period_us=PERIOD_US) == []
+    assert missed({2: (9_980_000, NOW_US + hours_us - 20_000)}, ahead_us=hours_us) == []
 
 
 def test_agents_that_send_less_often_are_helped_later() -> None:
-    newest = {
-        1: message(1, sent_us=NOW_US, heard={2: (9_890_000, 9_900_000)}),
-        2: message(2, sent_us=9_990_000, heard={1: (NOW_US, 9_980_000)}),
-    }
-    received_us = {1: NOW_US, 2: NOW_US}
-    assert missed_by_peers(newest, NOW_US, received_us, period_us=20_000) == [2]
-    assert missed_by_peers(newest, NOW_US, received_us, period_us=40_000) == [], "two in a row may get lost"
+    heard = {2: (9_890_000, 9_900_000)}
+    assert missed(heard, period_us=20_000) == [2]
+    assert missed(heard, period_us=40_000) == [], "two in a row may get lost"
+
+
+def test_who_was_held_up_itself_is_not_missed() -> None:
+    """Nothing of agent 2 has come for 190 ms, because it has sent nothing for as long but 20 ms ago."""
+    heard = {2: (9_800_000, 9_810_000)}
+    assert missed(heard, lacked_us=20_000) == []
+    assert missed(heard, lacked_us=80_000) == [2], "control: what it lacks was sent long before it said so"
+
+
+HELPERS = (0, 3, 4, 5, 6)
+
+
+@pytest.mark.parametrize(("silent_us", "helping"), [(90_000, 2), (130_000, 4), (170_000, 5), (70_000, 0)])
+def test_two_help_at_once_and_the_others_only_if_that_does_not(silent_us: int, helping: int) -> None:
+    heard = {2: (NEWEST_US - silent_us, NOW_US - silent_us)} | {i: (NOW_US, NOW_US) for i in HELPERS}
+    by = [own for own in HELPERS if 2 in missed(heard, own=own, helpers=tuple(i for i in HELPERS if i != own))]
+    assert len(by) == helping
+
+
+def test_those_help_first_whom_the_peer_hears_and_who_have_what_it_lacks() -> None:
+    heard = {2: (NEWEST_US - 90_000, NOW_US - 90_000), 6: (NOW_US, NOW_US), 3: (NOW_US, NOW_US)}  # not 0, 4 and 5
+    by = [own for own in HELPERS if 2 in missed(heard, own=own, helpers=tuple(i for i in HELPERS if i != own))]
+    assert by == [3, 6]
+    assert 2 in missed(heard, own=0, helpers=(6,)), "3 has not said that it has heard agent 2"
+
+
+def test_who_helps_differs_from_agent_to_agent() -> None:
+    """Of ten agents that one does not hear, each is passed on by others of the twenty that have heard it."""
+    agents, lost, late = range(22), range(1, 11), (NEWEST_US - 90_000, NOW_US - 90_000)
+    heard_all = {i: (NEWEST_US, NOW_US) for i in agents}
+    newest = {i: message(i, sent_us=NEWEST_US, heard=heard_all) for i in agents}
+    newest[1] = message(1, sent_us=NOW_US, heard={i: late if i in lost else (NOW_US, NOW_US) for i in agents if i != 1})
+    counts = []
+    for own in set(agents) - set(lost):
+        others = {i: said for i, said in newest.items() if i != own}
+        args = (own, others, {i: (NOW_US, NOW_US) for i in others}, NOW_US)
+        counts.append(len(missed_by_peers(*args, period_us=PERIOD_US, lacked_us=lambda *_: 1_000_000)))
+    assert sum(counts) == 2 * (len(lost) - 1)
+    assert max(counts) <= 5
