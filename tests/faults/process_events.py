@@ -120,7 +120,7 @@ def agent_starved(start: Start) -> None:
     thread = threading.Thread(target=starve)
     thread.start()
     try:
-        launched.reacts("it rests for overload", lambda: bool(launched.said("overload")) or told_overload(launched))
+        launched.reacts("it rests for overload", lambda: told_overload(launched))
     finally:
         ends.set()
         thread.join(5.0)

@@ -114,7 +114,7 @@ ROWS = (
         script=agent_starved,
         off=in_program(
             "agent",
-            "import swarmctl.control.failsafe.overload as it\nit.Overload.update = lambda *_: None",
+            "import swarmctl.control.failsafe.overload as it\nit.Overload.update = lambda *_, **__: None",
         ),
     ),
     LaunchedRow(
