@@ -11,9 +11,37 @@ from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
 from swarmctl.core.types import Array, AttitudeSetpoint
 
 VALID_US = 100_000  # a setpoint is stale after this time
+HELD_MAX_US = 200_000  # longest time for which a setpoint is expected to be held
 _SUNK_M = 0.3  # below the reference; more than a gust costs that thrust makes good again
 _CLIMB_1_S2 = 2.0  # vertical acceleration left for each metre more
 _CLIMB_MAX_M_S2 = 1.0
+
+
+class SetpointHold:
+    """Expects for how long the next setpoint is held, from the times of those before.
+
+    The inputs of a plan change after every step; the one that is sent is held until the next tick. Where ticks are
+    missed these are several steps, and the input of their middle stands for those that are never sent. The first one is
+    bounded to the change of a single step: a vehicle whose agent runs one of ten ticks swings ever farther with it.
+    """
+
+    def __init__(self) -> None:
+        self._sent_us: tuple[int, int] | None = None  # the last two, the newer one first
+
+    def middle_us(self, now_us: int, dt_us: int) -> int:
+        """Return by how much the middle of the next setpoint's time is later than that of one step of the plan.
+
+        One late tick after others in time is no reason to expect another. To be called with each setpoint.
+
+        Args:
+            now_us: monotonic time.
+            dt_us: step of the plan.
+        """
+        sent_us = self._sent_us
+        self._sent_us = (now_us, now_us if sent_us is None else sent_us[0])
+        if sent_us is None:
+            return 0
+        return max(0, min(now_us - sent_us[0], sent_us[0] - sent_us[1], HELD_MAX_US) - dt_us) // 2
 
 
 def within_tilt(virtual_control: Array, params: VehicleModelParams) -> Array:

@@ -12,7 +12,7 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.mpc.problem import Start
 from swarmctl.control.reference.heading import Heading
-from swarmctl.control.setpoint import holding_height, setpoint_of, within_tilt
+from swarmctl.control.setpoint import SetpointHold, holding_height, setpoint_of, within_tilt
 from swarmctl.core.frames import euler_from_quat
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Array, AttitudeSetpoint, Plan, Reference, VehicleState
@@ -44,6 +44,7 @@ class SetpointOutput:
         self._thrust_max_m_s2 = min(setup.controller.mpc.thrust_max_m_s2, self._model.thrust_range_m_s2()[1])
         self._ports, self._safety_filter, self._own_state = ports, safety_filter, own_state
         self._references, self._alerts = references, alerts
+        self._hold = SetpointHold()
 
     def send(
         self,
@@ -71,7 +72,8 @@ class SetpointOutput:
             self._safety_filter.skip(now_us)
             return None
         act_us, estimate = now_us + self._own_state.delay_us, self._own_state.estimate
-        step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual_control) - 1)
+        middle_us = act_us + self._hold.middle_us(now_us, flown.dt_us)
+        step = min(max(0, (middle_us - flown.t0_us) // flown.dt_us), len(flown.virtual_control) - 1)
         virtual_control = self._safety_filter.keep_apart(
             now_us,
             self._ports.utc_of_us(act_us),

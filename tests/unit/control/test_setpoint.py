@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmctl.control.model import Predictor, VehicleModelParams, acceleration, tilt_rate
-from swarmctl.control.setpoint import VALID_US, holding_height, setpoint_of, within_tilt
+from swarmctl.control.setpoint import HELD_MAX_US, VALID_US, SetpointHold, holding_height, setpoint_of, within_tilt
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned, euler_from_quat, quat_from_body_z
 from swarmctl.core.types import Array, VehicleState
 from tests import builders
@@ -207,3 +207,27 @@ def test_who_has_sunk_tilts_no_more_than_its_thrust_carries_up_again() -> None:
     upright = np.array([0.1, 0.1, 15.0])
     assert holding_height(upright, 2.0, 15.0) is upright
     assert holding_height(asked, 2.0, 10.0)[:2] == pytest.approx([0.0, 0.0]), "level where thrust is too weak"
+
+
+@pytest.mark.parametrize(
+    ("intervals_ms", "later_ms"),
+    [
+        ((), 0.0),
+        ((20, 20, 20), 0.0),
+        ((40, 40), 10.0),
+        ((100, 100, 100), 40.0),
+        ((20, 300), 0.0),
+        ((300, 300), 90.0),
+        ((100, 20), 0.0),
+        ((10, 10), 0.0),
+    ],
+    ids=["first", "in time", "25 Hz", "one of five", "one stall", "longest", "in time again", "faster than the plan"],
+)
+def test_a_setpoint_that_is_held_for_long_is_that_of_the_middle(intervals_ms: tuple[int, ...], later_ms: float) -> None:
+    hold, now_us = SetpointHold(), 5_000_000
+    later_us = hold.middle_us(now_us, 20_000)
+    for interval_ms in intervals_ms:
+        now_us += interval_ms * 1000
+        later_us = hold.middle_us(now_us, 20_000)
+    assert later_us == later_ms * 1000
+    assert later_us < HELD_MAX_US / 2
