@@ -108,7 +108,9 @@ def test_negative_control_commitments_are_relied_on_whose_tube_leaves_out_the_es
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = Coordination.publish
-    monkeypatch.setattr(Coordination, "publish", lambda self, utc_us, **given: told(self, utc_us, **given | {"unsure_m": 0.0}))
+    monkeypatch.setattr(
+        Coordination, "publish", lambda self, utc_us, **given: told(self, utc_us, **given | {"unsure_m": 0.0})
+    )
     flight = fly_without_gps(fly, (*BESIDE, *GUARANTEED, *NOT_LANDED), until=closer_than(TOO_CLOSE_M))
     assert separation_aloft_m(flight) < TOO_CLOSE_M
 

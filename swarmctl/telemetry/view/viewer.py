@@ -1,7 +1,7 @@
 """The only process that uses rerun: reads ticks from the bus, serves a live view and writes `telemetry.rrd`.
 
-`python -m swarmctl.telemetry.view.viewer --run R --bus ENDPOINT --flight JSON --run-dir DIR`. It only serves, and has the
-processor time that others leave, so it can't delay an agent; if it freezes or is killed, only the view is lost. The
+`python -m swarmctl.telemetry.view.viewer --run R --bus ENDPOINT --flight JSON --run-dir DIR`. It only serves, and has
+the processor time that others leave, so it can't delay an agent; if it freezes or is killed, only the view is lost. The
 launcher ends it by SIGTERM (SIGHUP works as well when it was started by hand); it ignores Ctrl-C.
 """
 

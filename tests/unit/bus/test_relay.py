@@ -119,7 +119,7 @@ def missed(
     ahead_us: int = 0,
 ) -> list[int]:
     """Return what `own` passes on to agent 1, which says of whom it has `heard`; all but agent 1 have heard agent 2."""
-    known = {agent: (NEWEST_US, NOW_US) for agent in (0, 1, 2, *helpers)}
+    known = dict.fromkeys((0, 1, 2, *helpers), (NEWEST_US, NOW_US))
     newest = {
         1: message(1, sent_us=NOW_US + ahead_us, heard=heard),
         2: message(2, sent_us=NEWEST_US, heard={1: (NOW_US, NEWEST_US - 10_000)}),
@@ -170,7 +170,7 @@ HELPERS = (0, 3, 4, 5, 6)
 
 @pytest.mark.parametrize(("silent_us", "helping"), [(90_000, 2), (130_000, 4), (170_000, 5), (70_000, 0)])
 def test_two_help_at_once_and_the_others_only_if_that_does_not(silent_us: int, helping: int) -> None:
-    heard = {2: (NEWEST_US - silent_us, NOW_US - silent_us)} | {i: (NOW_US, NOW_US) for i in HELPERS}
+    heard = {2: (NEWEST_US - silent_us, NOW_US - silent_us)} | dict.fromkeys(HELPERS, (NOW_US, NOW_US))
     by = [own for own in HELPERS if 2 in missed(heard, own=own, helpers=tuple(i for i in HELPERS if i != own))]
     assert len(by) == helping
 
@@ -185,13 +185,13 @@ def test_those_help_first_whom_the_peer_hears_and_who_have_what_it_lacks() -> No
 def test_who_helps_differs_from_agent_to_agent() -> None:
     """Of ten agents that one does not hear, each is passed on by others of the twenty that have heard it."""
     agents, lost, late = range(22), range(1, 11), (NEWEST_US - 90_000, NOW_US - 90_000)
-    heard_all = {i: (NEWEST_US, NOW_US) for i in agents}
+    heard_all = dict.fromkeys(agents, (NEWEST_US, NOW_US))
     newest = {i: message(i, sent_us=NEWEST_US, heard=heard_all) for i in agents}
     newest[1] = message(1, sent_us=NOW_US, heard={i: late if i in lost else (NOW_US, NOW_US) for i in agents if i != 1})
     counts = []
     for own in set(agents) - set(lost):
         others = {i: said for i, said in newest.items() if i != own}
-        args = (own, others, {i: (NOW_US, NOW_US) for i in others}, NOW_US)
+        args = (own, others, dict.fromkeys(others, (NOW_US, NOW_US)), NOW_US)
         counts.append(len(missed_by_peers(*args, period_us=PERIOD_US, lacked_us=lambda *_: 1_000_000)))
     assert sum(counts) == 2 * (len(lost) - 1)
     assert max(counts) <= 5

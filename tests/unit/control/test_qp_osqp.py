@@ -50,7 +50,7 @@ def set_up_by_the_class(problem: Values) -> osqp.OSQP:
         adaptive_rho=True,
         adaptive_rho_interval=PARAMS.adaptive_rho_interval,
         check_termination=PARAMS.check_every,
-        scaling=0,
+        scaling=PARAMS.scaling,
         check_dualgap=False,
         warm_starting=True,
     )

@@ -53,7 +53,7 @@ class OsqpSolver:
         if not is_finite(p_values, q, a_values, lower, upper):
             return NOT_FINITE
         if is_first := self._solver is None:
-            solution = self._cold(p_values, q, a_values, lower, upper=upper, scaling=0)
+            solution = self._cold(p_values, q, a_values, lower, upper=upper, scaling=self._params.scaling)
         else:
             self._solver.update_data_vec(q=q, l=lower, u=upper)
             self._solver.update_data_mat(P_x=p_values, P_i=None, A_x=a_values, A_i=None)
