@@ -78,9 +78,15 @@ class PeerTrajectories:
                 self._used_error_us.setdefault(sender, error_us)
 
     def lacked_us(self, message: TrajectoryMessage, agent: int, stamp_us: int) -> int:
-        """Return how long before the sender of `message` sent it a peer sent its first message after a stamp.
+        """Return for how long the sender of a message had lacked, when it sent it, what a peer sent after a stamp.
 
-        Where that is forgotten it is the oldest one that is not.
+        Both times are by the own clock. Of a peer's messages only the last ones are remembered: older ones count as if
+        they had been sent with the oldest of those.
+
+        Args:
+            message: says what its sender has heard.
+            agent: the peer, whose newest message is later than the stamp.
+            stamp_us: of the newest message of the peer that the sender has heard.
         """
         first_us = next(stamp for stamp in self._stamps_us[agent] if stamp > stamp_us)
         said_us = message.sent_utc_us - self._clocks.ahead_us(message.agent)

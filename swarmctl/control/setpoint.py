@@ -21,8 +21,9 @@ class SetpointHold:
     """Expects for how long the next setpoint is held, from the times of those before.
 
     The inputs of a plan change after every step; the one that is sent is held until the next tick. Where ticks are
-    missed these are several steps, and the input of their middle stands for those that are never sent. The first one is
-    bounded to the change of a single step: a vehicle whose agent runs one of ten ticks swings ever farther with it.
+    missed, or are meant to be rarer, these are several steps, and the input of their middle stands for those that are
+    never sent. The first one is bounded to the change of a single step: a vehicle whose agent runs one of ten ticks
+    swings ever farther with it.
     """
 
     def __init__(self) -> None:

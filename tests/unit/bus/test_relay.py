@@ -168,17 +168,20 @@ def test_who_was_held_up_itself_is_not_missed() -> None:
 HELPERS = (0, 3, 4, 5, 6)
 
 
+def those_who_help(heard: dict[int, tuple[int, int]]) -> list[int]:
+    """Return which of them pass on agent 2's newest message to agent 1, which has `heard` so much."""
+    return [own for own in HELPERS if 2 in missed(heard, own=own, helpers=tuple(i for i in HELPERS if i != own))]
+
+
 @pytest.mark.parametrize(("silent_us", "helping"), [(90_000, 2), (130_000, 4), (170_000, 5), (70_000, 0)])
 def test_two_help_at_once_and_the_others_only_if_that_does_not(silent_us: int, helping: int) -> None:
     heard = {2: (NEWEST_US - silent_us, NOW_US - silent_us)} | dict.fromkeys(HELPERS, (NOW_US, NOW_US))
-    by = [own for own in HELPERS if 2 in missed(heard, own=own, helpers=tuple(i for i in HELPERS if i != own))]
-    assert len(by) == helping
+    assert len(those_who_help(heard)) == helping
 
 
 def test_those_help_first_whom_the_peer_hears_and_who_have_what_it_lacks() -> None:
     heard = {2: (NEWEST_US - 90_000, NOW_US - 90_000), 6: (NOW_US, NOW_US), 3: (NOW_US, NOW_US)}  # not 0, 4 and 5
-    by = [own for own in HELPERS if 2 in missed(heard, own=own, helpers=tuple(i for i in HELPERS if i != own))]
-    assert by == [3, 6]
+    assert those_who_help(heard) == [3, 6]
     assert 2 in missed(heard, own=0, helpers=(6,)), "3 has not said that it has heard agent 2"
 
 

@@ -31,7 +31,7 @@ def values(rng: np.random.Generator) -> Values:
     return hessian, rng.normal(size=VARIABLES), rows[pattern_index(DENSE)], lower, upper
 
 
-def set_up_by_the_class(problem: Values) -> osqp.OSQP:
+def set_up_by_the_class(problem: Values, scaling: int) -> osqp.OSQP:
     hessian, rows = sparse.csc_matrix(np.triu(SQUARE).astype(float)), sparse.csc_matrix(DENSE.astype(float))
     hessian.data, slope, rows.data, lower, upper = problem
     solver = osqp.OSQP(algebra="builtin")
@@ -50,18 +50,20 @@ def set_up_by_the_class(problem: Values) -> osqp.OSQP:
         adaptive_rho=True,
         adaptive_rho_interval=PARAMS.adaptive_rho_interval,
         check_termination=PARAMS.check_every,
-        scaling=PARAMS.scaling,
+        scaling=scaling,
         check_dualgap=False,
         warm_starting=True,
     )
     return solver
 
 
+@pytest.mark.parametrize("scaling", [0, 2])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_series_of_problems_has_the_answers_of_the_python_class(seed: int) -> None:
+def test_a_series_of_problems_has_the_answers_of_the_python_class(seed: int, scaling: int) -> None:
     rng = np.random.default_rng(seed)
     problems = [values(rng) for _ in range(20)]
-    ours, theirs = OsqpSolver(SQUARE, DENSE, PARAMS), set_up_by_the_class(problems[0])
+    params = PARAMS.model_copy(update={"scaling": scaling})
+    ours, theirs = OsqpSolver(SQUARE, DENSE, params), set_up_by_the_class(problems[0], scaling)
     answers = []
     for k, (hessian, slope, rows, lower, upper) in enumerate(problems):
         if k > 0:

@@ -46,7 +46,7 @@ class QpParams(Params):
     rho: float = Field(0.01, gt=0, le=1e6)  # first step size of OSQP; adapted from then on
     adaptive_rho_interval: int = Field(50, ge=1, le=10000)  # iterations, never seconds
     check_every: int = Field(10, ge=1, le=1000)  # iterations between two looks at the residual
-    scaling: int = Field(0, ge=0, le=100)  # passes of equilibration before each solve; 2 halve the iterations
+    scaling: int = Field(0, ge=0, le=100)  # passes of equilibration before each solve: two halve the iterations
     retry: Literal["auto", "osqp"] = "auto"  # auto: DAQP solves what OSQP does not finish, unless it is missing
 
     @property
