@@ -66,6 +66,8 @@ class SwarmOfHosts:
             process.terminate()
             process.wait(20)
             process.stdout.close()
+        assert process.returncode == 0
+        assert not place.exists()
 
     def endpoint(self, name: str) -> str:
         """Return the socket of a host's router."""

@@ -78,11 +78,11 @@ class DatagramLinks:
             thread.start()
 
     def close(self) -> None:
-        """Send and receive nothing from now on."""
+        """End with the session, which is closed before this.
+
+        A subscriber can't be undeclared while a thread waits for it.
+        """
         self._ends.set()
-        for subscriber in self._subscribers:
-            with contextlib.suppress(zenoh.ZError):
-                subscriber.undeclare()
         for thread in self._threads:
             thread.join(_CLOSE_S)
         self._socket.close()
@@ -93,7 +93,7 @@ class DatagramLinks:
             try:
                 sample = subscriber.recv()
             except zenoh.ZError:
-                return  # undeclared
+                return  # the session is closed
             self._send(sample)
 
     def _send(self, sample: Any) -> None:

@@ -66,9 +66,9 @@ def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: boo
         request_realtime()
     print(f"router ready {endpoint}", flush=True)
     signal.sigwait({signal.SIGTERM})
+    close_within(session, CLOSE_DEADLINE_S)
     if datagrams is not None:
         datagrams.close()
-    close_within(session, CLOSE_DEADLINE_S)
     remove_socket(socket_path)
 
 
