@@ -199,6 +199,7 @@ class Commitments:
         self._cleared.update((id(trajectory), trajectory) for trajectory in new)
         if all(agent in peers and peers[agent].acknowledged.get(self._agent) == mine.number for agent in required):
             self.committed, self.proposal = mine.trajectory, None
+            self._compatible, self._compatible_with = self._cleared, mine.trajectory
             self._late_us -= self._proposed_late_us
             self.counts.committed += 1
             self._latencies_s.append((utc_us - mine.made_utc_us) * 1e-6)

@@ -10,7 +10,7 @@ import pytest
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit import trajectory_planner
 from swarmctl.control.commit.protocol import Commitments
-from swarmctl.control.commit.trajectory_planner import DesiredReference
+from swarmctl.control.commit.trajectory_planner import DesiredReference, TrajectoryPlanner
 from swarmctl.control.reference.quintic import quintic_to
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
@@ -225,6 +225,21 @@ def test_an_acknowledgement_counts_for_its_proposal_only(off: int, commits: int)
     agent, proposal = proposing()
     agent.update(UTC_US + 20_000, acknowledging(proposal.number + off), {1})
     assert agent.counts.committed == commits
+
+
+def test_what_a_proposal_was_clear_of_is_not_compared_with_the_commitment_it_becomes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    agent, proposal = proposing()
+    answer = acknowledging(proposal.number)
+    agent.update(UTC_US + 20_000, answer, {1})
+    compared: list[int] = []
+    monkeypatch.setattr(TrajectoryPlanner, "conflicts", lambda self, own, utc_us, known: compared.append(len(known)))
+    assert agent.conflicting_peers(UTC_US + 20_000, answer) == set()
+    assert compared == []
+    evasion = {1: builders.trajectory_message(committed=resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000))}
+    agent.conflicting_peers(UTC_US + 40_000, evasion)
+    assert compared == [1], "another trajectory is, also where its points are the same"
 
 
 def test_an_acknowledgement_after_the_lead_is_too_late() -> None:
