@@ -234,7 +234,8 @@ def _host_lost(flight: Flight) -> None:
 
 
 def _agent_killed(flight: Flight) -> None:
-    os.kill(flight.agent_pid("bravo", 2), signal.SIGKILL)
+    bravo = next(host for host in flight.config.hosts if host.name == "bravo")
+    os.kill(flight.agent_pid(bravo.name, bravo.agents[0]), signal.SIGKILL)
 
 
 def _supervisor_stopped(flight: Flight) -> None:
@@ -302,7 +303,16 @@ def fly(scenario: str, config_path: Path, folder: Path, *, late_s: float, lost_0
         "least_separation_m": separation_m,
         "pair": touched,
         "ended_after_s": round(ended_s, 1),
+        "late_01": _late_01(folder, hosts),
     }
+
+
+def _late_01(folder: Path, hosts: Sequence[str]) -> float:
+    """Return the share of ticks that missed their deadline, on the hosts that have written a summary."""
+    summaries = (folder / host / "summary.json" for host in hosts)
+    timings = [json.loads(path.read_text(encoding="utf-8"))["timing"] for path in summaries if path.exists()]
+    due = sum(timing["due_ticks"] for timing in timings)
+    return round(sum(timing["late_ticks"] for timing in timings) / max(1, due), 5)
 
 
 def _least_separation_m(folder: Path, hosts: Sequence[str]) -> tuple[float, list[int]]:
