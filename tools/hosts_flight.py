@@ -311,8 +311,8 @@ def _late_01(folder: Path, hosts: Sequence[str]) -> float:
     """Return the share of ticks that missed their deadline, on the hosts that have written a summary."""
     summaries = (folder / host / "summary.json" for host in hosts)
     timings = [json.loads(path.read_text(encoding="utf-8"))["timing"] for path in summaries if path.exists()]
-    due = sum(timing["due_ticks"] for timing in timings)
-    return round(sum(timing["late_ticks"] for timing in timings) / max(1, due), 5)
+    late, due = (sum(int(timing[key]) for timing in timings) for key in ("late_ticks", "due_ticks"))
+    return round(late / max(1, due), 5)
 
 
 def _least_separation_m(folder: Path, hosts: Sequence[str]) -> tuple[float, list[int]]:

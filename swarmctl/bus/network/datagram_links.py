@@ -16,6 +16,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import zenoh
@@ -70,21 +71,24 @@ class DatagramLinks:
             for topic in TOPICS
             if not topic.reliable
         ]
-        self._threads = [threading.Thread(target=self._run, name="datagrams", daemon=True)] + [
+        self._receiver = threading.Thread(target=self._run, name="datagrams", daemon=True)
+        self._senders = [
             threading.Thread(target=self._send_from, args=(subscriber,), name="datagrams sent", daemon=True)
             for subscriber in self._subscribers
         ]
-        for thread in self._threads:
+        for thread in (self._receiver, *self._senders):
             thread.start()
 
-    def close(self) -> None:
-        """End with the session, which is closed before this.
+    def close(self, close_session: Callable[[], None]) -> None:
+        """Publish nothing more, close the session, and send nothing more.
 
-        A subscriber can't be undeclared while a thread waits for it.
+        Senders wait for what clients publish until then: a subscriber can't be undeclared while a thread waits for it.
         """
         self._ends.set()
-        for thread in self._threads:
-            thread.join(_CLOSE_S)
+        self._receiver.join(_CLOSE_S)
+        close_session()
+        for sender in self._senders:
+            sender.join(_CLOSE_S)
         self._socket.close()
 
     def _send_from(self, subscriber: Any) -> None:

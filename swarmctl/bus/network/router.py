@@ -12,11 +12,13 @@ these links: each is a datagram (`swarmctl.bus.network.datagram_links`).
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import zenoh
 
@@ -30,7 +32,7 @@ from swarmctl.bus.zenoh_bus import (
     open_session,
     socket_file,
 )
-from swarmctl.errors import StartError, SwarmError
+from swarmctl.errors import EXIT_OK, StartError, SwarmError
 from swarmctl.process_lifetime import die_with_parent, remove_socket
 from swarmctl.process_priority import request_realtime
 
@@ -66,9 +68,11 @@ def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: boo
         request_realtime()
     print(f"router ready {endpoint}", flush=True)
     signal.sigwait({signal.SIGTERM})
-    close_within(session, CLOSE_DEADLINE_S)
-    if datagrams is not None:
-        datagrams.close()
+    close_session = partial(close_within, session, CLOSE_DEADLINE_S)
+    if datagrams is None:
+        close_session()
+    else:
+        datagrams.close(close_session)
     remove_socket(socket_path)
 
 
@@ -112,8 +116,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main() -> int:
-    """Run the router process from the command line."""
+def main() -> NoReturn:
+    """Run the router process from the command line, and end the process."""
     parser = _parser()
     options = parser.parse_args()
     links = None
@@ -127,13 +131,16 @@ def main() -> int:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # for sigwait; zenoh's threads inherit the mask
     if options.die_with_parent:
         die_with_parent(signal.SIGTERM)
+    code = EXIT_OK
     try:
         run_router(options.endpoint, links, realtime=options.realtime)
     except SwarmError as error:
         print(error, file=sys.stderr)
-        return error.exit_code
-    return 0
+        code = error.exit_code
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # threads of Zenoh can keep an interpreter from ending: one router of some hundreds did not
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
