@@ -53,6 +53,29 @@ def test_negative_control_without_the_reaction_they_come_too_close(seed: int) ->
     assert flight.separation_m() < 1.0
 
 
+@pytest.mark.parametrize(("unprotected", "climbs"), [((), False), (UNPROTECTED, True)], ids=["", "control"])
+def test_agents_that_miss_nine_of_ten_deadlines_on_the_ground_stay_there(
+    unprotected: tuple[str, ...], climbs: bool
+) -> None:
+    """In the air they would have to rest and to land at once."""
+
+    def until(lockstep: Lockstep) -> bool:
+        one_tick_of(10)(lockstep)
+        return over(lockstep) or climbed_m(lockstep) > 1.0
+
+    lockstep = fly_now(*SWAP[:2], *unprotected, config="swap8.toml", until=until).lockstep
+    assert (climbed_m(lockstep) > 1.0) == climbs
+    if not climbs:
+        assert climbed_m(lockstep) < 0.1
+        assert {agent.outcome.split(":")[0] for agent in lockstep.agents if agent} == {"overload"}
+
+
+def climbed_m(lockstep: Lockstep) -> float:
+    """Return how far any vehicle has climbed from where it stood."""
+    heights_m = -lockstep.truth.reshape(-1, 4)["pos_ned_m"][:, :, 2]  # (T, N)
+    return float((heights_m[-1:] - heights_m[:1]).max(initial=0.0))
+
+
 @pytest.mark.parametrize("seed", [0, 2])
 def test_agents_missing_four_of_five_deadlines_swap_places_with_their_distance(seed: int) -> None:
     """A setpoint that is held for five steps of the plan is that of their middle.
