@@ -62,7 +62,7 @@ class DatagramLinks:
         self._publishers: dict[str, Any] = {}
         self._ends = threading.Event()
         self._told_s, self._told = time.monotonic(), 0
-        self._subscribers = [
+        subscribers = [
             session.declare_subscriber(
                 f"{_PREFIX}*/*/{topic.name}",
                 zenoh.handlers.RingChannel(_MOST_WAITING),
@@ -74,7 +74,7 @@ class DatagramLinks:
         self._receiver = threading.Thread(target=self._run, name="datagrams", daemon=True)
         self._senders = [
             threading.Thread(target=self._send_from, args=(subscriber,), name="datagrams sent", daemon=True)
-            for subscriber in self._subscribers
+            for subscriber in subscribers
         ]
         for thread in (self._receiver, *self._senders):
             thread.start()
