@@ -15,6 +15,7 @@ from swarmctl.agent.components import (
     make_estimator,
     make_interest,
     make_reference_selector,
+    make_rehearsal,
     make_safety_filter,
     make_separation_policy,
     make_state_machine,
@@ -108,6 +109,7 @@ class Agent:
             modes=self._modes,
             controller=controller,
             transit=transit,
+            rehearsal=make_rehearsal(setup, ports, self._world_model),
             alerts=alerts,
         )
         self._safety_filter = make_safety_filter(setup, ports, self._world_model)
@@ -351,7 +353,9 @@ class Agent:
             arm_in=None if autopilot.dialect is None else autopilot.dialect.arm_in,
             boots=autopilot.clock.boots,
             refusal=self._vehicle_setup.refusal if phase <= Phase.ARM else "",
-            unsettled=self._start_conditions.unsettled(now_us, accuracy_m, state, others_ned_m),
+            unsettled=self._start_conditions.unsettled(
+                now_us, accuracy_m, state, others_ned_m, missed_01=self._deadlines.missed_01
+            ),
             overload=self._deadlines.level,
             escalation=self._modes.escalation,
             setpoints_stopped=self._deadlines.stop_cause(now_us),

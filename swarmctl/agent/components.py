@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 from swarmctl.agent.flying.safety_filter import SafetyFilter
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.agent.planning.reference_selector import ReferenceSelector
+from swarmctl.agent.planning.rehearsal import Rehearsal
 from swarmctl.agent.planning.separation_policy import BestEffort, Guaranteed, SeparationPolicy
 from swarmctl.agent.ports import Ports
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.sharing.interest import Interest
 from swarmctl.agent.sharing.telemetry_publisher import TelemetryPublisher
-from swarmctl.control.commit.trajectory_planner import following
+from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner, following
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
@@ -38,19 +38,28 @@ def _guaranteed(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> Sep
         agent=setup.agent,
         boot_id=setup.boot_id,
         peers=setup.peers,
-        params=setup.params.commit,
-        mpc=setup.controller.mpc,
-        vehicle=setup.vehicle_model,
+        params=setup.params.commit.for_vehicle(setup.vehicle_model),
+        planner=_make_trajectory_planner(setup, ports.stopwatch_ns),
         separation=setup.separation,
-        volume=setup.volume,
-        max_keep_outs=setup.max_keep_outs,
         world_model=world_model,
         bus=ports.bus,
         note=ports.note,
-        stopwatch_ns=ports.stopwatch_ns,
         rate_hz=setup.params.rate_hz,
     )
     return Guaranteed(coordination, setup.mission.yaw_rad, ports.stopwatch_ns)
+
+
+def _make_trajectory_planner(setup: AgentSetup, stopwatch_ns: Stopwatch) -> TrajectoryPlanner:
+    return TrajectoryPlanner(
+        setup.agent,
+        setup.params.commit.for_vehicle(setup.vehicle_model),
+        setup.controller.mpc,
+        setup.vehicle_model,
+        setup.separation,
+        max_keep_outs=setup.max_keep_outs,
+        stopwatch_ns=stopwatch_ns,
+        volume=setup.volume,
+    )
 
 
 def _following(setup: AgentSetup) -> ControllerParams:
@@ -63,11 +72,14 @@ class SeparationMode:
 
     policy: Callable[[AgentSetup, Ports, WorldModel], SeparationPolicy]
     controller: Callable[[AgentSetup], ControllerParams]
+    proposals: Callable[[AgentSetup, Stopwatch], TrajectoryPlanner | None]  # what the policy plans by itself
 
 
 SEPARATION_MODES = {  # by `separation.mode`
-    "best_effort": SeparationMode(policy=_best_effort, controller=lambda setup: setup.controller),
-    "guaranteed": SeparationMode(policy=_guaranteed, controller=_following),
+    "best_effort": SeparationMode(
+        policy=_best_effort, controller=lambda setup: setup.controller, proposals=lambda *_: None
+    ),
+    "guaranteed": SeparationMode(policy=_guaranteed, controller=_following, proposals=_make_trajectory_planner),
 }
 
 
@@ -105,19 +117,36 @@ def make_vehicle_setup(setup: AgentSetup, ports: Ports) -> VehicleSetup:
 def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Controller, Controller]:
     """Return the controller for the mission and the one for the transits to the start and to the landing place."""
     params = SEPARATION_MODES[setup.separation.mode].controller(setup)
-    make = partial(
-        make_controller,
-        vehicle=setup.vehicle_model,
-        separation=setup.separation,
-        agent=setup.agent,
+    mission = _make_controller(setup, params, stopwatch_ns)
+    if params.follows_reference:
+        return mission, mission
+    return mission, _make_controller(setup, params.model_copy(update={"kind": "dmpc"}), stopwatch_ns)
+
+
+def make_rehearsal(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> Rehearsal:
+    """Return what plans before the vehicle flies; an own controller is called in flight only."""
+    mode = SEPARATION_MODES[setup.separation.mode]
+    params = mode.controller(setup)
+    if params.is_own:
+        params = params.model_copy(update={"kind": "dmpc"})
+    return Rehearsal(
+        _make_controller(setup, params, ports.stopwatch_ns),
+        mode.proposals(setup, ports.stopwatch_ns),
+        round(1e6 * setup.params.commit.period_s),
+        world_model,
+    )
+
+
+def _make_controller(setup: AgentSetup, params: ControllerParams, stopwatch_ns: Stopwatch) -> Controller:
+    return make_controller(
+        params,
+        setup.vehicle_model,
+        setup.separation,
+        setup.agent,
         max_keep_outs=setup.max_keep_outs,
         stopwatch_ns=stopwatch_ns,
         volume=setup.volume,
     )
-    mission = make(params)
-    if params.follows_reference:
-        return mission, mission
-    return mission, make(params.model_copy(update={"kind": "dmpc"}))
 
 
 def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:

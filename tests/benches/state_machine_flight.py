@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from swarmctl.control.failsafe.decision import NOTHING_WORN
-from swarmctl.control.failsafe.overload import Level
 from swarmctl.control.phases.inputs import PeerInputs, PhaseInputs
 from swarmctl.control.phases.mission_state import MissionSetup
 from swarmctl.control.phases.state_machine import MissionStateMachine
@@ -59,7 +58,6 @@ class Flight:
         self.setpoints_stopped = ""
         self.seen = True
         self.escalation = NOTHING_WORN
-        self.overload = Level.NONE
         self.excused: frozenset[int] = frozenset()
         self.peers = {k + 1: PeerInputs(Phase.STANDBY, 0, True) for k in range(peers)}
 
@@ -113,7 +111,6 @@ class Flight:
             unsettled=self.unsettled,
             cut_off=self.cut_off,
             escalation=self.escalation,
-            overload=self.overload,
             armed_told_us=self.now_us if self.beat_us is None else self.beat_us,
         )
         self.state_machine.begin_if_due(inputs.now_us, inputs.utc_us, inputs.state)  # before planning

@@ -9,6 +9,7 @@ from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.bus.bus import agent_name
 from swarmctl.control.collision.separation import radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
+from swarmctl.control.failsafe.overload import Readiness
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.control.reference.landing_places import nearest_in_plane_m
 from swarmctl.core.types import Array, Landed, Phase, VehicleState
@@ -18,17 +19,17 @@ _APART_FOR_US = 4_000_000  # estimates wander: vehicles have to be apart for as 
 
 
 class StartConditions:
-    """Judges the estimate's accuracy before the start, and tells what the agent waits for.
+    """Judges the estimate's accuracy and the processor before the start, and tells what the agent waits for.
 
     Args:
-        setup: the distances that the accuracy has to suffice for.
+        setup: the distances that the accuracy has to suffice for, and how many deadlines may be missed.
         mission: phase, and what it waits for.
         alerts: are told what it waits for, and of heights that differ.
     """
 
     def __init__(self, setup: AgentSetup, mission: MissionState, alerts: Alerts) -> None:
         self._setup, self._mission, self._alerts = setup, mission, alerts
-        self._accuracy = AccuracyMonitor()
+        self._accuracy, self._readiness = AccuracyMonitor(), Readiness(setup.params.overload)
         self._waits_since_us = 0
         self._close_us: int | None = None  # when another vehicle was last seen too close
 
@@ -38,19 +39,38 @@ class StartConditions:
         pos_accuracy_m: float | None,
         state: VehicleState | None,
         others_ned_m: Callable[[], Sequence[Array]],
+        *,
+        missed_01: float,
     ) -> str:
         """Return why arming must wait, or "".
 
         The estimator still settles, or is too inaccurate for the separation, or another vehicle stands too close: the
-        autopilot, which climbs first, knows no peers.
+        autopilot, which climbs first, knows no peers. Or rehearsals of plans, which begin in STANDBY, show that the
+        processor is too slow for a flight.
 
         Args:
             now_us: monotonic time.
             pos_accuracy_m: newest reported accuracy, 1-sigma; None while there is none.
             state: newest one.
             others_ned_m: returns the position (3,) of each peer.
+            missed_01: fraction of deadlines missed of late.
         """
-        if len(self._setup.starts_ned_m) == 1 or self._mission.phase > Phase.STANDBY:
+        if self._mission.phase > Phase.STANDBY:
+            return ""
+        if self._mission.phase < Phase.STANDBY:
+            self._readiness.reset()
+        too_slow = self._readiness.unmet(now_us, missed_01)
+        return self._uncertain(now_us, pos_accuracy_m, state, others_ned_m) or too_slow
+
+    def _uncertain(
+        self,
+        now_us: int,
+        pos_accuracy_m: float | None,
+        state: VehicleState | None,
+        others_ned_m: Callable[[], Sequence[Array]],
+    ) -> str:
+        """Return what the estimate does not suffice for, or ""."""
+        if len(self._setup.starts_ned_m) == 1:
             return ""
         self._accuracy.update(now_us, pos_accuracy_m)
         accuracy_m = self._accuracy.worst_m or 0.0  # if not reported, only body size and tracking error are checked

@@ -26,9 +26,6 @@ from swarmctl.control.commit.trajectory_planner import (
     slowed,
 )
 from swarmctl.control.commit.tube import Grip, Tube
-from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.swarm_mpc import MpcParams
-from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import MAX_MARGIN_M, Array, Phase, VehicleState
@@ -45,7 +42,9 @@ class Coordination:
     Args:
         agent, boot_id: identity in the own messages.
         peers: numbers of the other agents.
-        params, mpc, vehicle, separation, volume, max_keep_outs, stopwatch_ns: see `TrajectoryPlanner`.
+        params: those of `planner`, for its vehicle.
+        planner: makes and compares trajectories.
+        separation: distances to keep.
         world_model: paths, statuses and presence of peers, and obstacles.
         bus: is drained by `receive`.
         rate_hz: tick rate of every agent.
@@ -69,29 +68,14 @@ class Coordination:
         boot_id: int,
         peers: list[int],
         params: CommitParams,
-        mpc: MpcParams,
-        vehicle: VehicleModelParams,
+        planner: TrajectoryPlanner,
         separation: SeparationParams,
-        volume: FlightVolume | None,
-        max_keep_outs: int,
         world_model: WorldModel,
         bus: Bus,
         note: Callable[..., None],
-        stopwatch_ns: Callable[[], int],
         rate_hz: float,
     ) -> None:
         self._agent, self._boot_id, self._bus, self._world_model = agent, boot_id, bus, world_model
-        params = params.for_vehicle(vehicle)
-        planner = TrajectoryPlanner(
-            agent,
-            params,
-            mpc,
-            vehicle,
-            separation,
-            max_keep_outs=max_keep_outs,
-            stopwatch_ns=stopwatch_ns,
-            volume=volume,
-        )
         self._commitments = Commitments(agent, params, planner)
         refusals, presence = world_model.refusals, world_model.presence
         self._peer_trajectories = PeerTrajectories(

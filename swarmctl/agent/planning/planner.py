@@ -9,6 +9,7 @@ import numpy as np
 
 from swarmctl.agent.flying.mode_selector import ModeSelector
 from swarmctl.agent.planning.reference_selector import ReferenceSelector
+from swarmctl.agent.planning.rehearsal import Rehearsal
 from swarmctl.agent.planning.separation_policy import SeparationDirective, SeparationInputs, SeparationPolicy
 from swarmctl.agent.ports import Ports
 from swarmctl.agent.sensing.own_state import OwnState
@@ -42,6 +43,7 @@ class Planner:
         modes: mode of the newest tick, and the certified plan to linearise around.
         controller: for the mission.
         transit: controller for the ways to the start and to the landing place.
+        rehearsal: plans before the vehicle is flown.
         alerts: are told of deadlocks, of the flight volume and of peers that don't answer.
 
     Attributes:
@@ -62,12 +64,13 @@ class Planner:
         modes: ModeSelector,
         controller: Controller,
         transit: Controller,
+        rehearsal: Rehearsal,
         alerts: Alerts,
     ) -> None:
         self._utc_of_us, self._alerts = ports.utc_of_us, alerts
         self._world_model, self._own_state, self._mission = world_model, own_state, mission
         self._references, self._separation, self._modes = references, separation, modes
-        self.controller, self._transit = controller, transit
+        self.controller, self._transit, self._rehearsal = controller, transit, rehearsal
         self.directive = SeparationDirective()
         self._volume_watch = VolumeWatch(setup.volume, ports.note)
         self._encounters = Encounters()
@@ -92,6 +95,8 @@ class Planner:
         reference, now_ref = self._references.reference(state.pos_ned_m)
         self.directive = self._separate(now_us, state, keep_outs, controls)
         plan = self._solve(now_us, start, reference) if flies else None
+        if Phase.STANDBY <= mission.phase < Phase.GOTO_START:
+            self._rehearsal.plan(self._utc_of_us(now_us), start, mission.climb.rest_ned_m(state), keep_outs)
         return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=list(keep_outs))
 
     def reset(self) -> None:

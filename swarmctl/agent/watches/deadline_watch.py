@@ -31,6 +31,11 @@ class DeadlineWatch:
         return self._overload.level
 
     @property
+    def missed_01(self) -> float:
+        """Return the fraction of deadlines missed of late."""
+        return self._overload.missed_01
+
+    @property
     def margin_m(self) -> float:
         """Return by how much distances grow."""
         return self._overload.margin_m

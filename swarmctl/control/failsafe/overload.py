@@ -25,7 +25,7 @@ class OverloadParams(Params):
     widen_01: float = Field(0.15, gt=0, le=1)  # above this fraction distances grow
     margin_max_m: float = Field(0.2, ge=0, le=10)  # growth of distances at `hold_01`
     hold_01: float = Field(0.4, gt=0, le=1)  # from this fraction on the agent comes to rest
-    clear_01: float = Field(0.2, ge=0, le=1)  # below this fraction a resting agent continues
+    clear_01: float = Field(0.2, gt=0, le=1)  # below this fraction a resting agent goes on, and one that waits is armed
     land_after_s: float = Field(10.0, gt=0, le=600)  # longest hold for this reason; then land
     stall_memory_s: float = Field(30.0, ge=0, le=3600)  # time for which distances stay grown after a stall
     stall_accel_m_s2: float = Field(4.0, ge=0, le=50)  # growth a t^2 / 2 after a stall of t
@@ -175,3 +175,38 @@ class Overload:
             self._stalls.append((now_us, stalled_us))
         while self._stalls and now_us - self._stalls[0][0] > self._params.stall_memory_s * 1e6:
             self._stalls.popleft()
+
+
+class Readiness:
+    """Tells when a processor has carried the load of a flight for long enough to begin one.
+
+    An agent begins where one that rests for missed deadlines would go on: from `clear_01` on it has too much to do.
+
+    Args:
+        params: thresholds.
+    """
+
+    def __init__(self, params: OverloadParams) -> None:
+        self._params = params
+        self._since_us: int | None = None  # since when few enough are missed
+
+    def reset(self) -> None:
+        """Begin anew: the load is not that of a flight."""
+        self._since_us = None
+
+    def unmet(self, now_us: int, missed_01: float) -> str:
+        """Return what to wait for, or "".
+
+        Args:
+            now_us: monotonic time.
+            missed_01: fraction of deadlines missed of late.
+        """
+        p = self._params
+        if missed_01 >= p.clear_01:
+            self._since_us = None
+        elif self._since_us is None:
+            self._since_us = now_us
+        if self._since_us is not None and now_us - self._since_us >= p.window_s * 1e6:
+            return ""
+        few = f"fewer than {100.0 * p.clear_01:.0f} % of deadlines missed for {p.window_s:g} s"
+        return f"its processor to keep up: {few} (now {100.0 * missed_01:.0f} %)"

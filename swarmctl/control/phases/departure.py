@@ -6,7 +6,6 @@ from collections.abc import Iterable, Set
 
 import numpy as np
 
-from swarmctl.control.failsafe.overload import Level
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, VehicleState
 
@@ -30,8 +29,6 @@ def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[i
         return "the autopilot to tell whether it has landed"
     if not inputs.armable:
         return f"the autopilot to be ready to arm (it is in {state.mode.name})"
-    if inputs.overload >= Level.HOLD:  # it would have to rest, and then to land, as soon as it has control
-        return "its processor to keep up with its deadlines"
     if inputs.unsettled:
         return inputs.unsettled
     there = {agent for agent, peer in inputs.peers().items() if peer.phase >= Phase.STANDBY and peer.alive}

@@ -18,7 +18,7 @@ from swarmctl.bus.messages.json_messages import encode_message
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference
+from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, TrajectoryPlanner
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.clock import SimClock
@@ -42,7 +42,8 @@ class Bench:
         self.bus = hub.connect(agent_name(0))
         self.peer: LocalBus = hub.connect(PEER)
         self.alive = {agent_name(0), PEER}
-        separation = SeparationParams()
+        separation, vehicle = SeparationParams(), VehicleModelParams()
+        params = CommitParams().for_vehicle(vehicle)
         self.world_model = WorldModel(
             0, [1], separation, self.bus, rate_hz=RATE_HZ, note=lambda *_, **__: None, vouchers={}
         )
@@ -50,16 +51,14 @@ class Bench:
             agent=0,
             boot_id=1,
             peers=[1],
-            params=CommitParams(),
-            mpc=MpcParams(),
-            vehicle=VehicleModelParams(),
+            params=params,
+            planner=TrajectoryPlanner(
+                0, params, MpcParams(), vehicle, separation, max_keep_outs=2, stopwatch_ns=lambda: 0
+            ),
             separation=separation,
-            volume=None,
-            max_keep_outs=2,
             world_model=self.world_model,
             bus=self.bus,
             note=lambda name, **fields: self.told.append((name, fields)),
-            stopwatch_ns=lambda: 0,
             rate_hz=RATE_HZ,
         )
         self.seq = 0

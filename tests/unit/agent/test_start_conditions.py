@@ -12,11 +12,18 @@ from swarmctl.agent.mission.start_conditions import StartConditions
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.failsafe.overload import OverloadParams
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.core.types import Landed, Phase
 from tests import builders
 
 SECOND = 1_000_000
+SETUP = SimpleNamespace(
+    starts_ned_m=np.zeros((2, 3)),
+    separation=SeparationParams(),
+    drift_m=0.0,
+    params=SimpleNamespace(overload=OverloadParams()),
+)
 
 
 @pytest.mark.parametrize(
@@ -24,7 +31,7 @@ SECOND = 1_000_000
 )
 def test_an_agent_that_waits_no_longer_does_not_say_so(phase: Phase, waits_for: str) -> None:
     mission, alerts = SimpleNamespace(phase=Phase.STANDBY, waits_for="its estimator"), Alerts()
-    conditions = StartConditions(cast(AgentSetup, None), cast(MissionState, mission), alerts)
+    conditions = StartConditions(cast(AgentSetup, SETUP), cast(MissionState, mission), alerts)
     for now_us in range(0, 5 * SECOND, SECOND // 10):
         conditions.report(now_us)
     alert = alerts.newest(5 * SECOND)
@@ -46,9 +53,8 @@ def test_an_agent_that_waits_no_longer_does_not_say_so(phase: Phase, waits_for: 
     ],
 )
 def test_who_stands_at_another_height_than_a_peer_says_so(phase: Phase, others_m: dict[int, float], said: str) -> None:
-    setup, alerts = SimpleNamespace(separation=SeparationParams()), Alerts()
-    mission = SimpleNamespace(phase=phase)
-    conditions = StartConditions(cast(AgentSetup, setup), cast(MissionState, mission), alerts)
+    alerts, mission = Alerts(), SimpleNamespace(phase=phase)
+    conditions = StartConditions(cast(AgentSetup, SETUP), cast(MissionState, mission), alerts)
     stands = builders.vehicle_state(landed=Landed.ON_GROUND, pos_ned_m=np.array([0.0, 0.0, -5.0]))
     conditions.compare_heights(0, stands, lambda: others_m)
     alert = alerts.newest(0)
@@ -57,14 +63,13 @@ def test_who_stands_at_another_height_than_a_peer_says_so(phase: Phase, others_m
 
 
 def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_while() -> None:
-    setup = SimpleNamespace(starts_ned_m=np.zeros((2, 3)), separation=SeparationParams(), drift_m=0.0)
     mission = SimpleNamespace(phase=Phase.STANDBY)
-    conditions = StartConditions(cast(AgentSetup, setup), cast(MissionState, mission), Alerts())
+    conditions = StartConditions(cast(AgentSetup, SETUP), cast(MissionState, mission), Alerts())
     stands = builders.vehicle_state(landed=Landed.ON_GROUND)
 
     def waits_for(at_s: float, north_m: float) -> str:
         other = np.array([north_m, 0.0, -9.0])  # its height is no matter to a vehicle that climbs
-        return conditions.unsettled(round(at_s * SECOND), 0.05, stands, lambda: [other])
+        return conditions.unsettled(round(at_s * SECOND), 0.05, stands, lambda: [other], missed_01=0.0)
 
     for tenth in range(50):
         waits_for(tenth / 10.0, 1.0)
@@ -74,3 +79,26 @@ def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_w
     assert waits_for(9.2, 0.9) == ""
     mission.phase = Phase.ARM
     assert waits_for(9.3, 0.4) == "", "that is judged before"
+
+
+def test_an_agent_whose_processor_has_too_much_to_do_waits_until_it_keeps_up_for_a_while() -> None:
+    """Rehearsals begin in STANDBY: what was missed before says nothing, and neither does a short lull."""
+    mission = SimpleNamespace(phase=Phase.CONNECT)
+    lone = SimpleNamespace(starts_ned_m=np.zeros((1, 3)), params=SETUP.params)
+    conditions = StartConditions(cast(AgentSetup, lone), cast(MissionState, mission), Alerts())
+
+    def waits_for(at_s: float, missed_01: float) -> str:
+        return conditions.unsettled(round(at_s * SECOND), None, None, tuple, missed_01=missed_01)
+
+    for tenth in range(50):
+        waits_for(tenth / 10.0, 0.0)
+    mission.phase = Phase.STANDBY
+    few = "its processor to keep up: fewer than 20 % of deadlines missed for 2 s"
+    assert waits_for(5.0, 0.1) == f"{few} (now 10 %)"
+    assert waits_for(6.9, 0.37) == f"{few} (now 37 %)"
+    assert waits_for(7.0, 0.19) == f"{few} (now 19 %)"
+    assert waits_for(8.9, 0.19) == f"{few} (now 19 %)"
+    assert waits_for(9.0, 0.19) == ""
+    assert waits_for(9.1, 0.2) == f"{few} (now 20 %)"
+    mission.phase = Phase.ARM
+    assert waits_for(9.2, 0.5) == "", "overload in flight has other consequences"

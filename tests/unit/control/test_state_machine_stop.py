@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarmctl.control.failsafe.overload import Level
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.types import FlightMode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, ON_GROUND, START, Flight
@@ -129,17 +128,6 @@ def test_temporary_causes_are_waited_for_and_named_at_the_timeout() -> None:
     assert late.run(20.5) == []
     assert late.at == "DONE"
     assert "14.10 m" in late.mission.outcome
-
-
-@pytest.mark.parametrize("level", list(Level))
-def test_an_agent_that_would_have_to_rest_in_the_air_for_its_processor_does_not_take_off(level: Level) -> None:
-    flight = Flight()
-    flight.overload = level
-    assert (Verb.ARM in flight.run(3.0)) == (level < Level.HOLD)
-    if level is Level.HOLD:
-        assert "processor to keep up" in flight.mission.waits_for
-        flight.overload = Level.NONE
-        assert Verb.ARM in flight.run(0.3)
 
 
 def test_a_vehicle_left_in_offboard_is_put_on_hold_so_that_it_can_be_armed() -> None:
