@@ -191,7 +191,7 @@ class Config(Params):
             obstacles=tuple(JudgedObstacle(number=i, obstacle=o) for i, o in enumerate(self.obstacles)),
             obstacle_margin_m=self.limits.obstacle_margin_m,
             deadline_misses_01=self.limits.deadline_misses_01,
-            solver_name=self.controller.mpc.qp.solver,
+            solver_name=self.controller.mpc.qp.solver_name,
             solver_retry=self.controller.mpc.qp.retry_solver,
             mode=mode,
             duration_s=self.mission.duration_s,

@@ -156,7 +156,7 @@ def restarted_while_the_autopilot_flies_home(switched_off: Callable[[], None] = 
     flight.offboard_us.clear()
     flight.setpoints_us.clear()
     flight.restart_agent()
-    flight.step_for(2.0)
+    flight.step_for(4.0)  # until it has shown that it keeps up
     return flight
 
 

@@ -608,5 +608,5 @@ def test_commitments_keep_a_volume_whatever_tracks_them() -> None:
 
 
 def test_a_run_is_said_to_be_flown_with_the_solver_that_flies_it() -> None:
-    named = load(None, ["controller.mpc.qp.solver='daqp'"]).rules().solver_name
-    assert (load(None).rules().solver_name, named) == ("osqp", "daqp")
+    named = load(None, ["controller.mpc.qp.solver='osqp'"]).rules().solver_name
+    assert (load(None).rules().solver_name, named) == ("daqp", "osqp")

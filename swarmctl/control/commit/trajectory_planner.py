@@ -424,5 +424,6 @@ def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
             "thrust_max_m_s2": min(mpc.thrust_max_m_s2, 1.4 * GRAVITY_M_S2),
             "terminal_z": "none",
             "terminal_xy": "none",
+            "proximal_xy": 0.0,  # proposals answer commitments, which stand
         }
     )

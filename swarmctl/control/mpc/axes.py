@@ -27,6 +27,7 @@ class Axis:
     u_rest: float  # input that holds the vehicle still
     gain_m_s2: float  # nominal acceleration of a unit input; scales cost and terminal region
     terminal: Terminal
+    proximal: float = 0.0  # weight of what increments differ by from those planned before
     lag: Lag | None = None  # lag from input to acceleration; None for none
 
     @property
@@ -128,6 +129,7 @@ class AxesProblem:
     ref_vel_m_s: Array  # (Hp, axes)
     realised: Array | None = None  # (axes,) input realised at the start, of axes with a lag; None for the held one
     realised_1_s: Array | None = None  # (axes,) rate of `realised`; None for 0
+    before: Array | None = None  # (axes, Hc) scaled increments planned before, to change little; None for none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,6 +144,7 @@ class AxesSolution:
     status: str
     iterations: int
     u: Array  # (Hp, axes), held over each step
+    increments: Array  # (axes, Hc), scaled to [-1, 1]
     pos_m: Array  # (Hp, axes), steps 1..Hp
     vel_m_s: Array  # (Hp, axes)
     slack_m: float

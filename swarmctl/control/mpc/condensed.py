@@ -104,11 +104,12 @@ class CondensedMpc:
         """Return the motion under the increments of a solution, with what it violates."""
         x, ahead = _usable(solution), self.prediction
         increments = ahead.increments(x, forecast.u_prev)
+        scaled = ahead.scaled(increments)
         motion = forecast.free + np.einsum("qakc,ac->qka", forecast.response, increments)
         residual_m = gap_m = math.inf
         if x is not None:
             flown = x.copy()
-            flown[: increments.size] = ahead.scaled(increments)
+            flown[: increments.size] = scaled
             residual_m = self._program.residual_m(flown)
             gap_m = self._ends.gap(self._program.rows[self._ends], forecast, flown)
         return AxesSolution(
@@ -116,6 +117,7 @@ class CondensedMpc:
             status=solution.status,
             iterations=solution.iterations,
             u=forecast.u_prev + ahead.hold @ increments.T,
+            increments=scaled.reshape(increments.shape),
             pos_m=motion[0],
             vel_m_s=motion[1],
             slack_m=slack_m(self._program.rows[self.half_spaces], solution),

@@ -57,6 +57,7 @@ class MpcParams(Params):
     dthrust_max_m_s2: float = Field(5.0, gt=0, le=100)  # per step
     u_max: float = Field(0.2, gt=0, lt=1)  # sine of the tilt, each axis
     du_max: float = Field(0.05, gt=0, lt=1)  # per step
+    proximal_xy: float = Field(10.0, ge=0, le=1e4)  # weight of what a plan among keep-outs changes of the one before
     terminal_z: Terminal = "region"  # thesis: an equality, which limit-cycles with half a tick of delay
     terminal_xy: Terminal = "none"  # the same for x-y
     qp: QpParams = QpParams()
@@ -103,6 +104,7 @@ class MpcParams(Params):
             u_rest=0.0,
             gain_m_s2=GRAVITY_M_S2,
             terminal=self.terminal_xy,
+            proximal=self.proximal_xy,
             lag=vehicle.lag(),
         )
 
@@ -166,6 +168,8 @@ class SwarmMpc:
 
         self._xy = SizedMpc(across, max_keep_outs)
         self._xy_alone = across(0)  # without keep-outs the problem is small and solved exactly
+        self._newest: Array | None = None  # (2, Hc) increments of the newest plan
+        self._before: Array | None = None  # of the one of the tick before
         self._first_row = self._xy.prediction.first_row()
         following = np.minimum(np.arange(self.steps), params.horizon_z - 1)
         self._thrust_of = following if params.thrust_ahead == "planned" else 0 * following  # (steps,) of the z plan
@@ -173,6 +177,7 @@ class SwarmMpc:
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
         began_ns = self._stopwatch_ns()
+        self._before = self._newest
         up = self._solve_z(problem)
         guess = first_guess(problem, self._params.dt_s, self.steps)
         count = min(self.steps, len(up.pos_m))
@@ -193,8 +198,8 @@ class SwarmMpc:
         return planned(near, plan, self._separation, self._stopwatch_ns)
 
     def reset(self) -> None:
-        """Keep all: only a warm start outlasts a tick."""
-        return
+        """Forget the newest plan; solvers keep their warm starts."""
+        self._newest = None
 
     def _plan(
         self, problem: Problem, up: AxesSolution, began_ns: int, spaces: HalfSpaces | None, *, spaces_us: float
@@ -210,8 +215,10 @@ class SwarmMpc:
             ref_vel_m_s=problem.reference.vel_ned_m_s[1 : steps + 1, :2],
             realised=start.tilt,
             realised_1_s=start.tilt_rate_1_s,
+            before=None if spaces is None else self._before,
         )
         across = (self._xy_alone if spaces is None else self._xy).solve(asked, spaces)
+        self._newest = across.increments if across.solved else None
         pos, vel, virtual_control = np.empty((steps + 1, 3)), np.zeros((steps + 1, 3)), np.empty((steps, 3))
         pos[0], vel[0] = start.pos_ned_m, start.vel_ned_m_s
         pos[1:, :2], vel[1:, :2], virtual_control[:, :2] = across.pos_m, across.vel_m_s, across.u

@@ -1,4 +1,9 @@
-"""The cost of a condensed MPC: squared errors to the reference, squared increments, and the cost beyond the end."""
+"""The cost of a condensed MPC: squared errors to the reference, squared increments, and the cost beyond the end.
+
+Agents plan at the same time, each with what the others planned before: Jacobi iterations, in which exact answers
+overshoot. A proximal term, the squared difference to the increments planned before, damps them, as in the proximal
+Jacobian ADMM (Deng, Lai, Peng and Yin, J. Sci. Comput. 71, 2017, eq. 1.5). It vanishes where plans stay the same.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +24,12 @@ class TrackingCost:
         self._regions = {i: self._region(a) for i, a in enumerate(axes) if a.terminal == "region"}
         self.scale = 1.0 / max(self._largest(), 1e-12)
         self._own, hc = [prediction.columns(i) for i in range(len(axes))], prediction.horizon.control
+        self._moves = np.arange(hc)
         like, square = np.ones((len(axes), hc)), np.ones((len(axes), hc, hc))  # quicker than broadcast operands
         weights = np.array([[a.q_pos for a in axes], [a.q_vel for a in axes]])  # (2, axes)
         self._slope_weight, self._weight = weights[:, :, None] * like, weights[:, :, None, None] * square
         self._r = np.array([a.r * np.eye(hc) for a in axes])  # (axes, Hc, Hc)
+        self._proximal = np.array([a.proximal for a in axes])[:, None] * like  # (axes, Hc)
         self._slope_factor = np.array([2.0 * a.du_max * self.scale for a in axes])[:, None] * like
         self._factor = np.array([2.0 * a.du_max**2 * self.scale for a in axes])[:, None, None] * square
 
@@ -70,9 +77,14 @@ class TrackingCost:
             curvature[i] += weighted @ end
             pull[i] += weighted @ np.array(self._end_error(i, forecast))
         curvature = self._factor * (curvature + self._r)
+        pull = self._slope_factor * pull
+        if (before := forecast.asked.before) is not None:
+            weight = self._proximal * self._factor[:, 0]
+            curvature[:, self._moves, self._moves] += weight
+            pull -= weight * before
         for i, own in enumerate(self._own):
             hessian[own, own] = curvature[i]
-        slope[: pull.size] = (self._slope_factor * pull).ravel()
+        slope[: pull.size] = pull.ravel()
 
     def _end_response(self, i: int, forecast: Forecast) -> Array:
         """Return position, velocity and acceleration (3, Hc) at the end, due to unit increments of axis `i`."""

@@ -28,6 +28,7 @@ def solve_one(
     drift: float = 0.0,
     gain: float | Array = GAIN,
     ref_vel: float = 0.0,
+    before: Array | None = None,
 ) -> AxesSolution:
     steps = problem.prediction.horizon.prediction
     one = np.ones((steps, 1))
@@ -42,6 +43,7 @@ def solve_one(
             drift_m_s2=pushed,
             ref_pos_m=ref * one,
             ref_vel_m_s=ref_vel * one,
+            before=before,
         )
     )
 
@@ -100,6 +102,32 @@ def test_far_from_all_bounds_it_is_the_least_squares_solution(euler: bool, gain:
     solution = solve_one(problem, pos, vel, u_prev, ref, drift, gain)
     np.testing.assert_allclose(solution.u[:, 0], held(best, u_prev, 40), atol=2e-5)
     assert (solution.slack_m, solution.terminal_gap_m) == (0.0, 0.0)
+
+
+def test_the_proximal_term_draws_increments_to_those_planned_before() -> None:
+    wide = replace(AXIS, u_min=-2.0, u_max=2.0, du_max=0.5, r=0.3, proximal=2.0)
+    before = 0.5 * np.sin(np.arange(6))
+    pos, vel, u_prev, ref = 0.2, -0.1, 0.01, 0.35
+
+    def residuals(moves: Array) -> Array:
+        p, v = simulate(pos, vel, held(moves, u_prev, 40), GAIN, 0.0, 0.02, False)
+        changes = math.sqrt(2.0) * (moves - 0.5 * before)
+        return np.concatenate([math.sqrt(1.5) * (p - ref), math.sqrt(0.5) * v, math.sqrt(0.3) * moves, changes])
+
+    base = residuals(np.zeros(6))
+    jacobian = np.stack([residuals(unit) - base for unit in np.eye(6)], axis=1)
+    best: Array = np.linalg.lstsq(jacobian, -base, rcond=None)[0].astype(np.float64)
+    solution = solve_one(mpc(wide), pos, vel, u_prev, ref, before=before[None])
+    np.testing.assert_allclose(solution.u[:, 0], held(best, u_prev, 40), atol=2e-5)
+    np.testing.assert_allclose(0.5 * solution.increments[0], best, atol=2e-5)
+
+
+def test_the_proximal_term_changes_no_plan_that_stays_the_same() -> None:
+    without, problem = mpc(AXIS), mpc(replace(AXIS, proximal=5.0))
+    solution = solve_one(without, 0.2, -0.1, 0.01, 0.35)
+    again = solve_one(problem, 0.2, -0.1, 0.01, 0.35, before=solution.increments)
+    np.testing.assert_allclose(again.u, solution.u, atol=1e-5)
+    assert np.abs(solve_one(problem, 0.2, -0.1, 0.01, 0.35, before=-solution.increments).u - solution.u).max() > 0.01
 
 
 @pytest.mark.parametrize("ref", [100.0, -100.0])
@@ -269,7 +297,7 @@ def test_the_first_input_towards_an_end_out_of_reach_is_the_optimal_one(
 ) -> None:
     axis, horizon = replace(VERTICAL, terminal=terminal), Horizon(control=3, prediction=40, dt_s=0.02, euler=False)
     for ref in (-5.0, -10.0, 5.0):
-        both = [mpc(axis, horizon=horizon, qp=qp) for qp in (QpParams(), QpParams(solver="daqp"))]
+        both = [mpc(axis, horizon=horizon, qp=qp) for qp in (QpParams(solver="osqp"), QpParams(solver="daqp"))]
         flown, exact = (solve_one(problem, 0.0, 0.0, 9.81, ref, 9.81, -1.0) for problem in both)
         assert flown.solved
         assert exact.u[0, 0] == pytest.approx(9.81 - 5.0 * np.sign(ref))  # all there is

@@ -194,6 +194,7 @@ def solution(residual_m: float, solved: bool = True) -> AxesSolution:
         status="",
         iterations=1,
         u=two,
+        increments=np.zeros((2, 6)),
         pos_m=np.tile(HERE[:2], (40, 1)),
         vel_m_s=two,
         slack_m=0.0,

@@ -18,7 +18,7 @@ from swarmctl.control.mpc.solvers.registry import MAKERS, make_solver
 from swarmctl.core.types import Array
 from swarmctl.errors import ConfigError
 
-EXACT = QpParams(eps=1e-9, eps_relative=1e-9, max_iterations=50_000)
+EXACT = QpParams(solver="osqp", eps=1e-9, eps_relative=1e-9, max_iterations=50_000)
 SIZES = [(3, 5), (6, 20), (15, 60)]
 Pattern = NDArray[np.bool_]
 Values = tuple[Array, Array, Array, Array, Array]
@@ -157,16 +157,20 @@ def test_a_hessian_singular_in_floating_point_is_no_failure() -> None:
 
 def test_every_name_that_can_be_configured_has_a_solver() -> None:
     choices = get_args(QpParams.model_fields["solver"].annotation)
-    assert [*choices] == [*SOLVERS] == [*MAKERS]
+    assert [*choices] == ["auto", *SOLVERS]
+    assert [*SOLVERS] == [*MAKERS]
 
 
-def test_osqp_is_the_default() -> None:
-    assert load(None).controller.mpc.qp.solver == "osqp"
+def test_daqp_is_the_default_and_osqp_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert load(None).rules().solver_name == QpParams().solver_name == "daqp"
+    assert isinstance(make_solver(ONE, TWO, QpParams()), DaqpSolver)
+    monkeypatch.setitem(sys.modules, "daqp", None)
+    assert load(None).rules().solver_name == QpParams().solver_name == "osqp"
     assert isinstance(make_solver(ONE, TWO, QpParams()), OsqpSolver)
 
 
 def test_an_unknown_solver_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"qp\.solver = 'quadprog'.*'osqp' or 'daqp'"):
+    with pytest.raises(ConfigError, match=r"qp\.solver = 'quadprog'.*'auto', 'osqp' or 'daqp'"):
         load(None, ["controller.mpc.qp.solver='quadprog'"])
 
 

@@ -76,7 +76,7 @@ def test_a_series_of_problems_has_the_answers_of_the_python_class(seed: int, sca
     assert all((one != other).any() for one, other in pairwise(answers)), "each problem has its own answer"
 
 
-UNFINISHED = QpParams(eps=1e-9, eps_relative=1e-9, polish=False, max_iterations=10, check_every=1)
+UNFINISHED = QpParams(solver="osqp", eps=1e-9, eps_relative=1e-9, polish=False, max_iterations=10, check_every=1)
 
 
 def test_what_osqp_does_not_finish_is_solved_by_the_exact_solver() -> None:
@@ -90,13 +90,16 @@ def test_what_osqp_does_not_finish_is_solved_by_the_exact_solver() -> None:
 
 
 def test_without_its_package_osqp_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert QpParams().retry_solver == QpParams(solver="daqp").retry_solver == "daqp"
+    first = QpParams(solver="osqp")
+    assert first.retry_solver == QpParams(solver="daqp").retry_solver == QpParams().retry_solver == "daqp"
     monkeypatch.setitem(sys.modules, "daqp", None)
-    assert QpParams().retry_solver == "osqp"
-    solver = make_solver(SQUARE, DENSE, QpParams())
+    assert first.retry_solver == "osqp"
+    solver = make_solver(SQUARE, DENSE, first)
     assert solver.solve(*values(np.random.default_rng(1))).exact
 
 
 def test_the_one_that_is_asked_is_named_in_the_summary() -> None:
     assert load(None).rules().solver_retry == "daqp"
-    assert load(None, ["controller.mpc.qp.retry='osqp'"]).rules().solver_retry == "osqp"
+    assert (
+        load(None, ["controller.mpc.qp.solver='osqp'", "controller.mpc.qp.retry='osqp'"]).rules().solver_retry == "osqp"
+    )

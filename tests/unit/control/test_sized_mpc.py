@@ -21,6 +21,7 @@ ANSWER = AxesSolution(
     status="",
     iterations=0,
     u=np.zeros((1, 2)),
+    increments=np.zeros((2, 6)),
     pos_m=np.zeros((1, 2)),
     vel_m_s=np.zeros((1, 2)),
     slack_m=0.0,

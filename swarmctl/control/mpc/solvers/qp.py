@@ -38,7 +38,7 @@ def installed_solvers() -> tuple[str, ...]:
 class QpParams(Params):
     """Sets the solver and its parameters: all apply to OSQP; DAQP is exact and takes `max_iterations` only."""
 
-    solver: Literal["osqp", "daqp"] = "osqp"  # daqp: exact, and faster on small swarms
+    solver: Literal["auto", "osqp", "daqp"] = "auto"  # auto: DAQP, which is exact and faster, unless it is missing
     eps: float = Field(3e-3, gt=0, le=0.1)  # absolute; variables and rows are scaled to about 1
     eps_relative: float = Field(3e-4, ge=0, le=0.1)  # small: bounds far from active must not loosen the others
     max_iterations: int = Field(2500, ge=10, le=100000)  # then the last iterate is judged by its residual
@@ -50,16 +50,23 @@ class QpParams(Params):
     retry: Literal["auto", "osqp"] = "auto"  # auto: DAQP solves what OSQP does not finish, unless it is missing
 
     @property
+    def solver_name(self) -> str:
+        """Return the name of the solver that solves every problem first."""
+        if self.solver != "auto":
+            return self.solver
+        return "daqp" if SOLVERS["daqp"]() else "osqp"
+
+    @property
     def retry_solver(self) -> str:
         """Return the name of the solver of what the first one does not finish."""
-        by_daqp = self.solver == "daqp" or (self.retry == "auto" and SOLVERS["daqp"]())
+        by_daqp = self.solver_name == "daqp" or (self.retry == "auto" and SOLVERS["daqp"]())
         return "daqp" if by_daqp else "osqp"
 
     @field_validator("solver")
     @classmethod
     def _installed(cls, solver: str) -> str:
         """Refuse a solver that is not installed, before the first agent starts."""
-        if not SOLVERS[solver]():
+        if solver != "auto" and not SOLVERS[solver]():
             raise PydanticCustomError(
                 "missing_package",
                 "{solver} is not installed; pip install '{solver}', or use solver = 'osqp'",

@@ -31,4 +31,4 @@ MAKERS = {"osqp": _osqp, "daqp": _daqp}  # the same names as `qp.SOLVERS`
 
 def make_solver(p_pattern: Mask, a_pattern: Mask, params: QpParams) -> QpSolver:
     """Return the solver that the configuration asks for, for Hessians (n, n) and rows (m, n) of these patterns."""
-    return MAKERS[params.solver](p_pattern, a_pattern, params)
+    return MAKERS[params.solver_name](p_pattern, a_pattern, params)
