@@ -108,7 +108,7 @@ def climbed_m(lockstep: Lockstep) -> float:
     return float((heights_m[-1:] - heights_m[:1]).max(initial=0.0))
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, 5])
 def test_agents_missing_four_of_five_deadlines_swap_places_with_their_distance(seed: int) -> None:
     """A setpoint that is held for five steps of the plan is that of their middle.
 
@@ -119,14 +119,14 @@ def test_agents_missing_four_of_five_deadlines_swap_places_with_their_distance(s
 
 
 @pytest.mark.usefixtures("configured_starts")
-@pytest.mark.parametrize(("count", "below_m"), [(5, 0.7), (10, 0.6)])
+@pytest.mark.parametrize(("count", "seed"), [(5, 5), (10, 0)])
 def test_negative_control_with_the_first_input_they_swing_into_each_other(
-    count: int, below_m: float, monkeypatch: pytest.MonkeyPatch
+    count: int, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Six starts keep 0.49 to 0.82 m, and 0.25 to 0.51 m where they miss nine of ten: bodies touch below 0.48 m."""
+    """Six starts keep 0.47 to 0.83 m, and 0.10 to 0.55 m where they miss nine of ten: bodies touch below 0.48 m."""
     monkeypatch.setattr(setpoint, "HELD_MAX_US", 0)
-    flight = swapped(*UNPROTECTED, until=closer_than(below_m), at={0.5: one_tick_of(count)})
-    assert flight.separation_m() < below_m
+    flight = swapped(*UNPROTECTED, until=closer_than(0.6), at={0.5: one_tick_of(count)}, seed=seed)
+    assert flight.separation_m() < 0.6
 
 
 def test_an_overload_that_passes_delays_the_mission_and_no_more() -> None:

@@ -75,7 +75,7 @@ def test_a_sealed_flight_is_not_changed_by_who_continues_a_peers_messages(
 
 @pytest.mark.usefixtures("configured_starts")
 def test_negative_control_over_a_plain_bus_the_forger_is_believed(fly: Fly) -> None:
-    """Where plans keep no more from who comes closer; they do from this start, undisturbed."""
-    this: Fly = partial(fly, "separation.approach_01=0", seed=2)
+    """Where plans keep no more from who comes closer. Ten starts keep 0.46 to 0.88 m, undisturbed at least 0.85 m."""
+    this: Fly = partial(fly, "separation.approach_01=0")
     assert swap(this, until_s=UNTIL_S).separation_m() >= 0.85
     assert forged(this, lambda payload, _: payload, 0).separation_m() < 0.7

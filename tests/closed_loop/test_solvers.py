@@ -15,17 +15,17 @@ from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
 DURATION_S = 10.0
 MISSION = (f"mission.duration_s={DURATION_S}", "sitl.start=air")
 NUDGED = "start.positions_ned_m=[[-1.0,0.0,0.0],[0.0,0.001,0.0],[1.0,0.0,0.0]]"  # the second by 1 mm
-DAQP = "controller.mpc.qp.solver='daqp'"
+OSQP, DAQP = ("controller.mpc.qp.solver='osqp'", "controller.mpc.qp.solver='daqp'")
 
 
 @pytest.fixture(scope="module")
 def osqp() -> Flight:
-    return fly_now(*MISSION, until=mission_is_over)
+    return fly_now(*MISSION, OSQP)
 
 
 @pytest.fixture(scope="module")
 def daqp() -> Flight:
-    return fly_now(*MISSION, DAQP)
+    return fly_now(*MISSION, DAQP, until=mission_is_over)
 
 
 def apart_m(one: Flight, other: Flight) -> NDArray[np.float64]:
@@ -40,7 +40,7 @@ def apart_m(one: Flight, other: Flight) -> NDArray[np.float64]:
 
 
 def test_both_complete_the_mission_without_a_failed_plan(osqp: Flight, daqp: Flight) -> None:
-    assert daqp.problems == [], "also when it is handed back; with OSQP that is part of the other tests"
+    assert osqp.problems == [], "also when it is handed back; with DAQP that is part of the other tests"
     for flight in (osqp, daqp):
         assert flight.outcomes == {"completed"}
         assert all(not flight.tracked(agent)[0]["plan_status"].any() for agent in range(3))

@@ -208,5 +208,8 @@ class Readiness:
             self._since_us = now_us
         if self._since_us is not None and now_us - self._since_us >= p.window_s * 1e6:
             return ""
-        few = f"fewer than {100.0 * p.clear_01:.0f} % of deadlines missed for {p.window_s:g} s"
-        return f"its processor to keep up: {few} (now {100.0 * missed_01:.0f} %)"
+        asked_percent, now_percent = 100.0 * p.clear_01, 100.0 * missed_01
+        return (
+            f"its processor to keep up: fewer than {asked_percent:.0f} % of deadlines missed for {p.window_s:g} s "
+            f"(now {now_percent:.0f} %)"
+        )
