@@ -353,9 +353,8 @@ class Agent:
             arm_in=None if autopilot.dialect is None else autopilot.dialect.arm_in,
             boots=autopilot.clock.boots,
             refusal=self._vehicle_setup.refusal if phase <= Phase.ARM else "",
-            unsettled=self._start_conditions.unsettled(
-                now_us, accuracy_m, state, others_ned_m, missed_01=self._deadlines.missed_01
-            ),
+            unsettled=self._start_conditions.unsettled(now_us, accuracy_m, state, others_ned_m),
+            too_slow=self._start_conditions.too_slow(now_us, self._deadlines.missed_01),
             overload=self._deadlines.level,
             escalation=self._modes.escalation,
             setpoints_stopped=self._deadlines.stop_cause(now_us),

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from swarmctl.control.failsafe.decision import NOTHING_WORN
+from swarmctl.control.failsafe.overload import Level
 from swarmctl.control.phases.inputs import PeerInputs, PhaseInputs
 from swarmctl.control.phases.mission_state import MissionSetup
 from swarmctl.control.phases.state_machine import MissionStateMachine
@@ -52,7 +53,8 @@ class Flight:
         self.obstacles: tuple[Obstacle, ...] = ()
         self.arm_in: FlightMode | None = None
         self.boots = 0
-        self.refusal = self.unsettled = self.cut_off = ""
+        self.refusal = self.unsettled = self.too_slow = self.cut_off = ""
+        self.overload = Level.NONE
         self.beat_us: int | None = None  # arrival of the HEARTBEAT that reported `armed`; None: one with every step
         self.busy = self.unresponsive_peer = False
         self.setpoints_stopped = ""
@@ -109,6 +111,8 @@ class Flight:
             boots=self.boots,
             refusal=self.refusal,
             unsettled=self.unsettled,
+            too_slow=self.too_slow,
+            overload=self.overload,
             cut_off=self.cut_off,
             escalation=self.escalation,
             armed_told_us=self.now_us if self.beat_us is None else self.beat_us,

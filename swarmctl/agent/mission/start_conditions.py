@@ -39,38 +39,19 @@ class StartConditions:
         pos_accuracy_m: float | None,
         state: VehicleState | None,
         others_ned_m: Callable[[], Sequence[Array]],
-        *,
-        missed_01: float,
     ) -> str:
         """Return why arming must wait, or "".
 
         The estimator still settles, or is too inaccurate for the separation, or another vehicle stands too close: the
-        autopilot, which climbs first, knows no peers. Or rehearsals of plans, which begin in STANDBY, show that the
-        processor is too slow for a flight.
+        autopilot, which climbs first, knows no peers.
 
         Args:
             now_us: monotonic time.
             pos_accuracy_m: newest reported accuracy, 1-sigma; None while there is none.
             state: newest one.
             others_ned_m: returns the position (3,) of each peer.
-            missed_01: fraction of deadlines missed of late.
         """
-        if self._mission.phase > Phase.STANDBY:
-            return ""
-        if self._mission.phase < Phase.STANDBY:
-            self._readiness.reset()
-        too_slow = self._readiness.unmet(now_us, missed_01)
-        return self._uncertain(now_us, pos_accuracy_m, state, others_ned_m) or too_slow
-
-    def _uncertain(
-        self,
-        now_us: int,
-        pos_accuracy_m: float | None,
-        state: VehicleState | None,
-        others_ned_m: Callable[[], Sequence[Array]],
-    ) -> str:
-        """Return what the estimate does not suffice for, or ""."""
-        if len(self._setup.starts_ned_m) == 1:
+        if len(self._setup.starts_ned_m) == 1 or self._mission.phase > Phase.STANDBY:
             return ""
         self._accuracy.update(now_us, pos_accuracy_m)
         accuracy_m = self._accuracy.worst_m or 0.0  # if not reported, only body size and tracking error are checked
@@ -84,6 +65,19 @@ class StartConditions:
             self._close_us = now_us
         is_close = self._close_us is not None and now_us - self._close_us < _APART_FOR_US
         return f"{least_m:.2f} m to the next vehicle (now {nearest_m:.2f} m)" if is_close else ""
+
+    def too_slow(self, now_us: int, missed_01: float) -> str:
+        """Return what the processor has to show before arming, in the rehearsals of STANDBY, or "".
+
+        Args:
+            now_us: monotonic time.
+            missed_01: fraction of deadlines missed of late.
+        """
+        if self._mission.phase > Phase.STANDBY:
+            return ""
+        if self._mission.phase < Phase.STANDBY:
+            self._readiness.reset()
+        return self._readiness.unmet(now_us, missed_01)
 
     def compare_heights(
         self, now_us: int, state: VehicleState | None, standing_m: Callable[[], Mapping[int, float]]

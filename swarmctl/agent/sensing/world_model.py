@@ -342,7 +342,9 @@ class WorldModel:
         """Return phase, ready time and liveliness of every peer that has published a status."""
         alive = self._bus.alive()
         return {
-            agent: PeerInputs(Phase(status.phase), self._ready_utc_us(status), agent_name(agent) in alive)
+            agent: PeerInputs(
+                Phase(status.phase), self._ready_utc_us(status), agent_name(agent) in alive, status.keeps_up
+            )
             for agent, status in self._status.items()
         }
 

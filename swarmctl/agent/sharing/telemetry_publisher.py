@@ -168,6 +168,7 @@ class TelemetryPublisher:
             link_age_ms=-1.0 if received_us is None else (record.t_us - received_us) * 1e-3,
             ready_utc_us=mission.ready_utc_us,
             mission_t_s=_finite(record.mission_t_s),
+            keeps_up=mission.keeps_up,
             ends_in_s=_finite(mission.ends_in_s(record.t_us, record.utc_us)),
             outcome=mission.outcome,
             position_error_m=_finite(error_m),

@@ -32,7 +32,7 @@ Agents = Annotated[tuple[Count, ...], msgspec.Meta(max_length=256)]
 
 
 class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """Holds the status an agent publishes five times a second; peers use `phase` and `ready_utc_us`."""
+    """Holds the status an agent publishes five times a second; peers use `phase`, `keeps_up` and `ready_utc_us`."""
 
     agent: Count
     boot_id: Count
@@ -51,6 +51,7 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     gps_fix: int  # GPS_FIX_TYPE
     satellites: int
     link_age_ms: float  # since the newest message of the vehicle
+    keeps_up: bool = True  # with its deadlines, as it has shown in rehearsals on the ground
     ready_utc_us: Count  # time of reaching its start position, 0 before
     mission_t_s: float  # mission time, -1 outside of the mission
     ends_in_s: float  # until the mission, or what precedes or follows it, ends by itself; -1: it does not

@@ -29,11 +29,13 @@ def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[i
         return "the autopilot to tell whether it has landed"
     if not inputs.armable:
         return f"the autopilot to be ready to arm (it is in {state.mode.name})"
-    if inputs.unsettled:
-        return inputs.unsettled
-    there = {agent for agent, peer in inputs.peers().items() if peer.phase >= Phase.STANDBY and peer.alive}
-    if absent := peers - there:
+    if unmet := inputs.unsettled or inputs.too_slow:
+        return unmet
+    there = {agent: peer for agent, peer in inputs.peers().items() if peer.phase >= Phase.STANDBY and peer.alive}
+    if absent := peers - there.keys():
         return f"{names_of(absent)} to stand by"
+    if slow := {agent for agent, peer in there.items() if peer.phase is Phase.STANDBY and not peer.keeps_up}:
+        return f"the processor of {names_of(slow)} to keep up"
     if state.landed is Landed.ON_GROUND and (obstacle := _obstacle_over(inputs, top_ned_m)):
         return obstacle
     return "the autopilot's answers" if inputs.busy else ""

@@ -18,6 +18,7 @@ class PeerInputs:
     phase: Phase
     ready_utc_us: int
     alive: bool
+    keeps_up: bool = True  # with its deadlines, as it has shown in rehearsals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +42,7 @@ class PhaseInputs:
     boots: int = 0  # reboots of the autopilot so far
     refusal: str = ""  # reason why arming is refused for good, up to ARM
     unsettled: str = ""  # reason why arming must wait
+    too_slow: str = ""  # what its processor has yet to show, likewise
     overload: Level = Level.NONE  # response to missed deadlines
     escalation: Escalation = NOTHING_WORN  # response to what wears out: battery, link
     setpoints_stopped: str = ""  # by missed deadlines a moment ago, in words

@@ -62,6 +62,7 @@ class MissionState:
         ordered_begin_utc_us: UTC before which a mission that an operator has ordered does not begin; 0 without one.
         outcome: "completed", or why the mission was not; "" while it is under way.
         waits_for: unmet condition that keeps the vehicle on the ground, or from beginning the mission; or "".
+        keeps_up: the processor has shown before take-off that it carries the load of a flight.
         had_control: the autopilot follows our setpoints and control has not been given back.
         pilot_override: pilot or autopilot took over; lasts until an operator resumes.
         overridden_us: monotonic time of the last takeover.
@@ -94,7 +95,7 @@ class MissionState:
         self.first_tick_us: int | None = None
         self.requested_us = -REQUEST_PERIOD_US
         self.offered: OfferedMission | None = None
-        self.had_control = self.pilot_override = self.may_take_control = False
+        self.keeps_up = self.had_control = self.pilot_override = self.may_take_control = False
         self.setpoints_stopped = self.airborne = self.landing_seen = False
         self.arming, self.climb = ArmingEvidence(), Climb(setup.start_ned_m)
         self.trajectories = Trajectories(

@@ -140,7 +140,7 @@ class MissionStateMachine:
             return
         if inputs.mode is Mode.LAND and mission.phase < Phase.LAND:
             mission.give_up("no plan for too long", inputs, state)
-        if inputs.overload is Level.LAND and mission.may_fly_on:
+        if inputs.overload is Level.LAND and mission.may_fly_on and mission.phase > Phase.STANDBY:
             mission.give_up(OVERLOADED, inputs, state)
         if inputs.cut_off and mission.may_fly_on:
             mission.give_up(inputs.cut_off, inputs, state)

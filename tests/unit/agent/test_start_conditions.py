@@ -69,7 +69,7 @@ def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_w
 
     def waits_for(at_s: float, north_m: float) -> str:
         other = np.array([north_m, 0.0, -9.0])  # its height is no matter to a vehicle that climbs
-        return conditions.unsettled(round(at_s * SECOND), 0.05, stands, lambda: [other], missed_01=0.0)
+        return conditions.unsettled(round(at_s * SECOND), 0.05, stands, lambda: [other])
 
     for tenth in range(50):
         waits_for(tenth / 10.0, 1.0)
@@ -88,7 +88,7 @@ def test_an_agent_whose_processor_has_too_much_to_do_waits_until_it_keeps_up_for
     conditions = StartConditions(cast(AgentSetup, lone), cast(MissionState, mission), Alerts())
 
     def waits_for(at_s: float, missed_01: float) -> str:
-        return conditions.unsettled(round(at_s * SECOND), None, None, tuple, missed_01=missed_01)
+        return conditions.too_slow(round(at_s * SECOND), missed_01)
 
     for tenth in range(50):
         waits_for(tenth / 10.0, 0.0)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from swarmctl.control.failsafe.overload import Level
+from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.types import FlightMode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, ON_GROUND, START, Flight
@@ -128,6 +130,31 @@ def test_temporary_causes_are_waited_for_and_named_at_the_timeout() -> None:
     assert late.run(20.5) == []
     assert late.at == "DONE"
     assert "14.10 m" in late.mission.outcome
+
+
+@pytest.mark.parametrize("slow", ["own", "peer", ""])
+def test_nobody_takes_off_while_a_processor_has_yet_to_show_that_it_keeps_up(slow: str) -> None:
+    """Half a swarm in the air would wait there for the other half."""
+    flight = Flight(peers=1)
+    flight.too_slow = "its processor to keep up" if slow == "own" else ""
+    flight.peers[1] = PeerInputs(Phase.STANDBY, 0, True, keeps_up=slow != "peer")
+    assert (Verb.ARM in flight.run(3.0)) == (slow == "")
+    assert flight.mission.keeps_up == (slow != "own")
+    if slow == "own":
+        assert flight.mission.waits_for == "its processor to keep up"
+    if slow == "peer":
+        assert flight.mission.waits_for == "the processor of agent-1 to keep up"
+        flight.peers[1] = PeerInputs(Phase.STANDBY, 0, True, keeps_up=True)
+        assert Verb.ARM in flight.run(0.3)
+
+
+def test_an_overloaded_agent_waits_on_the_ground_until_the_patience_with_the_start_ends() -> None:
+    flight = Flight()
+    flight.overload, flight.too_slow = Level.LAND, "its processor to keep up"
+    flight.run(80.0)
+    assert flight.mission.phase is Phase.STANDBY
+    flight.run(12.0)
+    assert flight.mission.outcome == "not tracking after 90 s (STANDBY): its processor to keep up"
 
 
 def test_a_vehicle_left_in_offboard_is_put_on_hold_so_that_it_can_be_armed() -> None:

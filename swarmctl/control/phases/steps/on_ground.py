@@ -13,6 +13,7 @@ from swarmctl.core.types import Command, FlightMode, Landed, Phase, VehicleState
 
 def standby(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
     """Wait until every start condition is met."""
+    mission.keeps_up = not inputs.too_slow
     if not inputs.prepared:  # the autopilot has rebooted since CONNECT
         mission.waits_for = "the link to be set up again after a reboot of the autopilot"
         return []
