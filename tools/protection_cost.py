@@ -50,7 +50,25 @@ FLIGHT_S = 15.0
 SAID = {PATH: 632, TRAJECTORY: 1800, TICK: 1500, STATUS: 900}  # bytes, about as in flight
 TICK_S, STATUS_TICKS = 0.02, 10
 RUN_ROUTER = "from swarmctl.bus.network.router import main\nraise SystemExit(main())"
-OPEN = "import swarmctl.bus.network.router_links as links\nlinks.access_settings = lambda *_: {}\n"
+OPEN = """import swarmctl.bus.network.router_links as links
+from swarmctl.bus.topics import TOPICS
+rule = {
+    "id": "no datagrams",
+    "permission": "deny",
+    "flows": ["egress"],
+    "messages": ["put"],
+    "key_exprs": [f"swarm/*/*/{topic.name}" for topic in TOPICS if not topic.reliable],
+}
+links.access_settings = lambda *_: {
+    "access_control": {
+        "enabled": True,
+        "default_permission": "allow",
+        "rules": [rule],
+        "subjects": [{"id": "links", "link_protocols": ["quic", "udp"]}],
+        "policies": [{"rules": ["no datagrams"], "subjects": ["links"]}],
+    }
+}
+"""  # else what goes by datagrams goes by links as well, and round and round between them
 OVER_UDP = """import json
 import swarmctl.bus.network.router as router
 opened = router.open_session

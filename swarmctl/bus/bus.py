@@ -32,7 +32,7 @@ class Bus(Protocol):
         """Receive a topic from these senders from now on, and from nobody else."""
 
     def refused(self) -> list[RefusedMessage]:
-        """Return the messages that were not delivered since the last call; only sealed ones are refused by a bus."""
+        """Return what was not delivered since the last call: sealed messages that do not verify, misdelivered ones."""
         return []
 
     def relay(self, agents: Iterable[int]) -> int:

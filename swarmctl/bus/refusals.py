@@ -13,6 +13,7 @@ MALFORMED = "malformed"
 IDENTITY = "identity"  # the name inside differs from that in the key
 UNSEALED = "unsealed"  # has no seal, where messages have one: `bus.network.seals`
 FORGED = "forged"  # its seal is not by who has this name
+MISDELIVERED = "misdelivered"  # the bus has brought it under the key of another message: `bus.zenoh_bus`
 UNKNOWN_PEER = "unknown_peer"
 UNCONFIRMED = "unconfirmed"  # perhaps a restart; becomes BOOT or SEQUENCE if the accepted stream continues
 BOOT = "boot"  # another boot id, while the accepted stream continues
@@ -21,7 +22,8 @@ STALE_ORDER = "stale_order"
 FUTURE_ORDER = "future_order"
 SUPERSEDED_ORDER = "superseded_order"  # a newer order has been obeyed
 
-HARMLESS = frozenset((REPLAYED, LATE, UNCONFIRMED, SUPERSEDED_ORDER))  # caused by networks or restarts alone
+# Caused by networks, restarts or Zenoh alone
+HARMLESS = frozenset((REPLAYED, LATE, MISDELIVERED, UNCONFIRMED, SUPERSEDED_ORDER))
 _EVENT_PERIOD_US = 1_000_000
 _ALERT_HOLD_US = 5_000_000  # time an alert is shown after the last refusal
 

@@ -3,6 +3,10 @@
 It uses one Unix socket in a private directory, without port or discovery. Samples wait in one ring for each topic and
 sender until the tick drains them: no callback and no FIFO could block reception. `swarmctl.bus.peers` judges freshness
 from the payload; nothing here looks into a payload.
+
+Zenoh 1.10.2 has brought messages under the keys of others, a dozen at once, after a process had stood still for a
+second (`tools/misdeliveries.py`): an agent's path as that of another one. So each message bears a mark of the key that
+it was published under as attachment, and is dropped where it comes under another key. What bears none is delivered.
 """
 
 from __future__ import annotations
@@ -14,13 +18,15 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from swarmctl.bus.bus import Bus
+from swarmctl.bus.refusals import MISDELIVERED, RefusedMessage
 from swarmctl.bus.silence import DEAF_S, SilenceWatch
 from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
 from swarmctl.errors import StartError
@@ -39,6 +45,8 @@ _LINK_OPEN_TIMEOUT_MS = 5000  # of links between routers: one that was cut is ba
 # processor for 2 s, as in a launch on a machine under load, was deaf for good.
 _CLIENT_OPEN_TIMEOUT_MS = 60_000
 _MAX_SOCKET_PATH = 100  # sun_path is 108 bytes
+_MARK_BYTES = 8
+_MOST_REFUSED = 4096  # kept until they are asked for
 
 COMMON_SETTINGS: dict[str, Any] = {
     "scouting/multicast/enabled": False,
@@ -49,13 +57,60 @@ COMMON_SETTINGS: dict[str, Any] = {
 }
 
 
+class MarkedPublisher:
+    """Publishes under one key, whose mark every message bears; messages are dropped where the queue is full.
+
+    Args:
+        session: of Zenoh.
+        key: to publish under.
+        reliable: sent again where a link loses it.
+    """
+
+    def __init__(self, session: Any, key: str, *, reliable: bool) -> None:
+        reliability = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
+        self._mark = _mark_of(key)
+        self._publisher = session.declare_publisher(
+            key, congestion_control=zenoh.CongestionControl.DROP, reliability=reliability
+        )
+
+    def put(self, payload: bytes) -> None:
+        """Pass a message to the session."""
+        self._publisher.put(payload, attachment=self._mark)
+
+    def undeclare(self) -> None:
+        """Publish nothing more."""
+        self._publisher.undeclare()
+
+
+class _Inbox:
+    """Receives what is published under one key."""
+
+    def __init__(self, session: Any, key: str, ring: int) -> None:
+        self._mark, self._ring = _mark_of(key), ring
+        self._subscriber = session.declare_subscriber(
+            key, zenoh.handlers.RingChannel(ring), allowed_origin=zenoh.Locality.REMOTE
+        )
+
+    def take(self) -> tuple[Sequence[Any], int]:
+        """Return the payloads that have come, and how many messages were of other keys."""
+        samples = _drain(self._subscriber, self._ring)
+        if not samples:
+            return (), 0  # from most senders nothing has come, in most ticks
+        payloads = [sample.payload for sample in samples if _bears(sample, self._mark)]
+        return payloads, len(samples) - len(payloads)
+
+    def undeclare(self) -> None:
+        """Receive nothing more."""
+        self._subscriber.undeclare()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Joined:
     """One session, and what it has declared."""
 
     session: Any
-    publishers: Mapping[Topic, Any]
-    subscribers: Mapping[Topic, dict[str, Any]]  # by topic and sender
+    publishers: Mapping[Topic, MarkedPublisher]
+    subscribers: Mapping[Topic, dict[str, _Inbox]]  # by topic and sender
     tokens: Any  # subscriber of liveliness tokens
     own_token: Any
 
@@ -102,6 +157,7 @@ class ZenohBus(Bus):
         )
         self._alive: frozenset[str] = frozenset()
         self._arrivals: Counter[str] = Counter()
+        self._refused: list[RefusedMessage] = []
         self._silence = SilenceWatch(deaf_s)
         self._opening: threading.Thread | None = None
         self._next: _Joined | None = None  # up, and not yet in use
@@ -118,10 +174,12 @@ class ZenohBus(Bus):
         """Return (sender, payload) of a topic, oldest first for each sender, at most one ring of each."""
         self._take_over()
         arrived: list[tuple[str, bytes]] = []
-        for sender, subscriber in self._now.subscribers.get(topic, {}).items():
-            if samples := _drain(subscriber, topic.ring):  # there is nothing from most, in most ticks
-                payloads, most_bytes = (sample.payload for sample in samples), topic.max_bytes + self._seal_bytes
-                arrived += [(sender, p.to_bytes() if len(p) <= most_bytes else TOO_LONG) for p in payloads]
+        most_bytes = topic.max_bytes + self._seal_bytes
+        for sender, inbox in self._now.subscribers.get(topic, {}).items():
+            payloads, misdelivered = inbox.take()
+            arrived += [(sender, p.to_bytes() if len(p) <= most_bytes else TOO_LONG) for p in payloads]
+            if misdelivered and len(self._refused) < _MOST_REFUSED:
+                self._refused += [RefusedMessage(sender, topic.name, MISDELIVERED)] * misdelivered
         if arrived:
             self._silence.hear()
         if self._silence.is_deaf(time.monotonic()):
@@ -132,6 +190,11 @@ class ZenohBus(Bus):
         """Receive a topic from these senders only; what has come from others is dropped."""
         self._subscriptions[topic] = tuple(senders)
         self._subscribe(topic)
+
+    def refused(self) -> list[RefusedMessage]:
+        """Return the messages that came under keys of others since the last call."""
+        refused, self._refused = self._refused, []
+        return refused
 
     def alive(self) -> frozenset[str]:
         """Return senders whose liveliness token is present; none, not even this one, while the router is lost."""
@@ -198,7 +261,7 @@ class ZenohBus(Bus):
                 now.pop(sender).undeclare()
             for sender in wanted:
                 if sender not in now:
-                    now[sender] = _subscriber(self._now.session, f"{self._prefix}/{sender}/{topic.name}", topic)
+                    now[sender] = _Inbox(self._now.session, f"{self._prefix}/{sender}/{topic.name}", topic.ring)
 
     def _is_linked(self) -> bool:
         """Return whether the session is linked to a router; the own token is not told of where it moves to another."""
@@ -228,10 +291,10 @@ def _join(
     """Open a session and declare everything."""
     session = _open_client(endpoint, lease_ms, connect_timeout_ms)
     publishers = {
-        topic: declare_publisher(session, f"{prefix}/{me}/{topic.name}", reliable=topic.reliable) for topic in TOPICS
+        topic: MarkedPublisher(session, f"{prefix}/{me}/{topic.name}", reliable=topic.reliable) for topic in TOPICS
     }
     subscribers = {
-        topic: {sender: _subscriber(session, f"{prefix}/{sender}/{topic.name}", topic) for sender in senders}
+        topic: {sender: _Inbox(session, f"{prefix}/{sender}/{topic.name}", topic.ring) for sender in senders}
         for topic, senders in dict(subscriptions).items()
     }
     ring: Any = zenoh.handlers.RingChannel(_ALIVE_RING)
@@ -244,14 +307,19 @@ def _join(
     )
 
 
-def declare_publisher(session: Any, key: str, *, reliable: bool) -> Any:
-    """Return a publisher whose messages are dropped where the queue is full."""
-    reliability = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
-    return session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP, reliability=reliability)
+def is_misdelivered(sample: Any) -> bool:
+    """Tell whether a sample bears the mark of another key than the one it came under."""
+    return not _bears(sample, _mark_of(str(sample.key_expr)))
 
 
-def _subscriber(session: Any, key: str, topic: Topic) -> Any:
-    return session.declare_subscriber(key, zenoh.handlers.RingChannel(topic.ring), allowed_origin=zenoh.Locality.REMOTE)
+def _bears(sample: Any, mark: bytes) -> bool:
+    attachment = sample.attachment
+    return attachment is None or bool(attachment.to_bytes() == mark)
+
+
+@cache
+def _mark_of(key: str) -> bytes:
+    return blake2b(key.encode(), digest_size=_MARK_BYTES).digest()
 
 
 def socket_file(endpoint: str) -> Path:

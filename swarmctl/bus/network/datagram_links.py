@@ -25,7 +25,7 @@ from swarmctl.bus.network.datagram_routes import BEAT_S, Address, DatagramRoutes
 from swarmctl.bus.network.roster import OwnIdentity, split_address
 from swarmctl.bus.network.seals import PairKeys
 from swarmctl.bus.topics import TOPICS
-from swarmctl.bus.zenoh_bus import declare_publisher
+from swarmctl.bus.zenoh_bus import MarkedPublisher, is_misdelivered
 from swarmctl.errors import StartError
 
 _PREFIX = "swarm/"
@@ -59,7 +59,7 @@ class DatagramLinks:
         self._session, self._socket = session, sock
         self._routes = DatagramRoutes(identity.roster, identity.name, keys, addresses, session=number)
         self._lock = threading.Lock()  # several threads send, one receives
-        self._publishers: dict[str, Any] = {}
+        self._publishers: dict[str, MarkedPublisher] = {}
         self._ends = threading.Event()
         self._told_s, self._told = time.monotonic(), 0
         subscribers = [
@@ -101,6 +101,8 @@ class DatagramLinks:
             self._send(sample)
 
     def _send(self, sample: Any) -> None:
+        if is_misdelivered(sample):
+            return
         key = str(sample.key_expr).removeprefix(_PREFIX)
         with self._lock:
             outgoing = self._routes.send(key, sample.payload.to_bytes(), time.monotonic())
@@ -142,7 +144,7 @@ class DatagramLinks:
             if publisher is None:
                 if len(self._publishers) >= _MOST_PUBLISHERS:
                     self._publishers.pop(next(iter(self._publishers))).undeclare()
-                publisher = self._publishers[key] = declare_publisher(self._session, key, reliable=False)
+                publisher = self._publishers[key] = MarkedPublisher(self._session, key, reliable=False)
             publisher.put(payload)
 
     def _tell_refused(self, now_s: float) -> None:

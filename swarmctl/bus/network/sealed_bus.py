@@ -62,4 +62,4 @@ class SealedBus(ForwardingBus):
     def refused(self) -> list[RefusedMessage]:
         """Return the messages refused since the last call."""
         refused, self._refused = self._refused, []
-        return refused
+        return refused + self._bus.refused()

@@ -15,6 +15,7 @@ from swarmctl.core.params import Params
 
 _TOLD_MARGIN_M = 0.02  # a smaller growth of distances after a stall is not worth an alert
 _LOST_PART = 0.5  # of the time without setpoints that missed deadlines must explain
+_OVER_01 = 0.67  # of `widen_01`, below which wider distances are over; between both they grow by nothing
 _TOLD_WITHIN_US = 3_000_000  # a HEARTBEAT a second tells the mode, and some are lost
 
 
@@ -161,7 +162,8 @@ class Overload:
         elif self.missed_01 < p.clear_01:
             self._holds_since_us = None
         if self._holds_since_us is None:
-            self.level = Level.WIDEN if self.missed_01 >= p.widen_01 else Level.NONE
+            least_01 = p.widen_01 if self.level is Level.NONE else _OVER_01 * p.widen_01
+            self.level = Level.WIDEN if self.missed_01 >= least_01 else Level.NONE
         else:
             lands = now_us - self._holds_since_us > p.land_after_s * 1e6
             self.level = Level.LAND if lands else Level.HOLD

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import sys
 import textwrap
 import time
@@ -32,6 +33,7 @@ _WIDE = 117  # columns of a terminal that has room for everything
 _SILENT_S = 2.0  # without a status for so long an agent is lost to the operator
 _OPERATORS_MATTER = ("HOLD", "GOTO", "WAIT", "PILOT", "FAILSAFE", "LOST")  # whose beginning and end are lines
 _WAITS = "waits for "  # begins an alert on the ground, or before the mission
+_NOW = re.compile(r" \(now [^)]*\)")  # the present figure in it, which changes all the time
 _FIX = {0: "no", 1: "no", 2: "2D", 3: "3D", 4: "DGPS", 5: "float", 6: "RTK"}  # GPS_FIX_TYPE
 
 
@@ -128,7 +130,7 @@ class PlainLines:
         self._stream = stream
         self._started_s = time.monotonic()
         self._last: dict[int, tuple[str, str, str]] = {}
-        self._waited: dict[int, str] = {}  # for what, by agent
+        self._waited: dict[int, str] = {}  # for what, without present figures, by agent
 
     def print_line(self, text: str) -> None:
         with contextlib.suppress(OSError):  # the pipe is closed; the flight goes on
@@ -139,11 +141,12 @@ class PlainLines:
             phase = "" if view.status is None else name_of(Phase, view.status.phase)
             control = view.control if view.control in _OPERATORS_MATTER and not view.note else ""
             alert = view.note or (view.status.active_alert if view.status else "")
-            waits = alert.startswith(_WAITS) and alert != self._waited.get(view.agent)
+            what = _NOW.sub("", alert)
+            waits = alert.startswith(_WAITS) and what != self._waited.get(view.agent)
             if not waits and (phase, control, view.note) == self._last.get(view.agent, ("", "", "")):
                 continue
             self._last[view.agent] = (phase, control, view.note)
-            self._waited |= {view.agent: alert} if waits else {}
+            self._waited |= {view.agent: what} if waits else {}
             elapsed_s = time.monotonic() - self._started_s
             words = "  ".join(word for word in (agent_name(view.agent), phase, control, alert) if word)
             self.print_line(f"{elapsed_s:7.1f} s  {words}")

@@ -191,8 +191,10 @@ def _evaluate_separation(
         "scaled_min_m": None,
     }
     scale = np.array([1.0, 1.0, 1.0 / rules.downwash])
-    violations = []
-    for i, j in itertools.combinations(here, 2):
+    known = [agent for agent in here if np.isfinite(tracks.pos_ned_m[:, agent]).all(axis=1).any()]
+    unknown = [agent for agent in here if agent not in known] if len(here) > 1 else []
+    violations = [f"separation of agent {agent} can't be judged: no positions were recorded" for agent in unknown]
+    for i, j in itertools.combinations(known, 2):
         apart_m = tracks.pos_ned_m[:, i] - tracks.pos_ned_m[:, j]
         distance_m = np.linalg.norm(apart_m, axis=1)
         if not np.isfinite(distance_m).any():

@@ -142,7 +142,7 @@ def test_who_has_a_clock_that_is_not_known_is_not_judged() -> None:
     for recorded in unknown:
         summary = evaluate(recorded, RULES, "completed")
         assert summary["separation"]["min_m"] is None
-        assert "agents 0 and 1 can't be judged" in summary["violations"][0]
+        assert "agent 1 can't be judged" in summary["violations"][0]
         assert summary["violations"][1].startswith("agent 1: its clock is not known")
         assert summary["clocks"] == [{"id": 0, "ahead_s": 0.0}, {"id": 1, "ahead_s": None}]
     judged = evaluate(run_of_station(near, (0, 0), (1, 9_000), (1, 0), (1, 7_000)), RULES, "completed")

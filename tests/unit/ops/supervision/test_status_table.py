@@ -181,6 +181,18 @@ def test_lines_say_once_for_whom_an_agent_waits() -> None:
     ]
 
 
+def test_lines_do_not_repeat_a_wait_whose_figure_changes() -> None:
+    stream = io.StringIO()
+    lines, view = PlainLines(stream), AgentView(agent=2)
+    for wait in ("its processor (now 61 %)", "its processor (now 39 %)", "its clock (now 3 s)"):
+        view.status = status(2, phase=Phase.STANDBY, active_alert=f"waits for {wait}")
+        lines.show([view])
+    assert [line.split("waits for ")[1] for line in stream.getvalue().splitlines()] == [
+        "its processor (now 61 %)",
+        "its clock (now 3 s)",
+    ]
+
+
 def test_the_live_table_fits_the_terminal_it_is_on() -> None:
     stream = io.StringIO()
     table = LiveTable(Console(file=stream, width=80, height=24, force_terminal=True, color_system=None))
