@@ -16,7 +16,6 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import zenoh
@@ -25,7 +24,7 @@ from swarmctl.bus.network.datagram_routes import BEAT_S, Address, DatagramRoutes
 from swarmctl.bus.network.roster import OwnIdentity, split_address
 from swarmctl.bus.network.seals import PairKeys
 from swarmctl.bus.topics import TOPICS
-from swarmctl.bus.zenoh_bus import MarkedPublisher, is_misdelivered
+from swarmctl.bus.zenoh_bus import CLOSE_DEADLINE_S, MarkedPublisher, close_within, is_misdelivered
 from swarmctl.errors import StartError
 
 _PREFIX = "swarm/"
@@ -79,14 +78,14 @@ class DatagramLinks:
         for thread in (self._receiver, *self._senders):
             thread.start()
 
-    def close(self, close_session: Callable[[], None]) -> None:
+    def close(self) -> None:
         """Publish nothing more, close the session, and send nothing more.
 
         Senders wait for what clients publish until then: a subscriber can't be undeclared while a thread waits for it.
         """
         self._ends.set()
         self._receiver.join(_CLOSE_S)
-        close_session()
+        close_within(self._session, CLOSE_DEADLINE_S)
         for sender in self._senders:
             sender.join(_CLOSE_S)
         self._socket.close()

@@ -16,7 +16,6 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -68,11 +67,10 @@ def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: boo
         request_realtime()
     print(f"router ready {endpoint}", flush=True)
     signal.sigwait({signal.SIGTERM})
-    close_session = partial(close_within, session, CLOSE_DEADLINE_S)
     if datagrams is None:
-        close_session()
+        close_within(session, CLOSE_DEADLINE_S)
     else:
-        datagrams.close(close_session)
+        datagrams.close()
     remove_socket(socket_path)
 
 
