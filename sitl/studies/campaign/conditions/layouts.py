@@ -48,6 +48,23 @@ def far_goals(
     raise ValueError(f"no goals {way_m} m away from {len(starts)} starts")
 
 
+def permuted(rng: np.random.Generator, starts: Array, *, way_m: float) -> Array:
+    """Return the starts (N, 3) in another order, each at least `way_m` from the one it replaces.
+
+    Raises:
+        ValueError: no order was found.
+    """
+    order = rng.permutation(len(starts))
+    for _ in range(_TRIES):
+        near = np.flatnonzero(np.linalg.norm(starts[order] - starts, axis=1) < way_m)
+        if len(near) == 0:
+            return starts[order]
+        for place in near:  # an order that is far for all is one of a million: those who are near exchange theirs
+            other = int(rng.integers(len(starts)))
+            order[place], order[other] = order[other], order[place]
+    raise ValueError(f"no order in which {len(starts)} starts are {way_m} m from their own")
+
+
 def forest(rng: np.random.Generator, columns: int, radius_m: float, apart_m: float) -> Array:
     """Return axes (columns, 3) of columns inside a circle round the origin, no two closer than `apart_m`."""
     axes: list[Array] = []

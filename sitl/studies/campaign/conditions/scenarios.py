@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sitl.studies.campaign.conditions.events import Appearance, Death, Partition, ScenarioEvent
-from sitl.studies.campaign.conditions.layouts import far_goals, forest, ring, scattered, walls
+from sitl.studies.campaign.conditions.layouts import far_goals, forest, permuted, ring, scattered, walls
 from swarmctl.core.clock import ClockError
 from swarmctl.core.types import Array
 
@@ -160,6 +160,13 @@ def _random(rng: np.random.Generator, agents: int) -> Layout:
     )
 
 
+def _permutation(rng: np.random.Generator, agents: int) -> Layout:
+    low, high = np.array([-20.0, -20.0, -12.0]), np.array([20.0, 20.0, -2.0])
+    starts = scattered(rng, agents, low, high, apart_m=2.0 * THESIS.radius_m)
+    goals = permuted(rng, starts, way_m=5.0)
+    return Layout(size=THESIS, starts_ned_m=starts, settings=_go(goals), limit_s=60.0, goals_ned_m=goals)
+
+
 def _same_goal(rng: np.random.Generator, agents: int) -> Layout:
     starts = ring(agents, max(4.0, 0.7 * THESIS.radius_m / math.sin(math.pi / max(agents, 2))), 0.0)
     starts[:, :2] += rng.uniform(-0.2, 0.2, (agents, 2))
@@ -249,6 +256,9 @@ SCENARIOS: dict[str, Scenario] = {
     ),
     "random": Scenario(
         title="random transitions in 3 x 3 x 2 m, small vehicles", draw=_random, agents=(4, 10, 20), alone=True
+    ),
+    "permutation": Scenario(
+        title="every agent to the start of another one, in 40 x 40 x 10 m", draw=_permutation, agents=(10, 100), needs=2
     ),
     "same_goal": Scenario(title="all agents to one point", draw=_same_goal, agents=(3, 6, 10)),
     "forest": Scenario(title="swap through 20 columns, small vehicles", draw=_forest, agents=(10,), needs=2),
