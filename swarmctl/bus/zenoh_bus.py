@@ -4,9 +4,10 @@ It uses one Unix socket in a private directory, without port or discovery. Sampl
 sender until the tick drains them: no callback and no FIFO could block reception. `swarmctl.bus.peers` judges freshness
 from the payload; nothing here looks into a payload.
 
-Zenoh 1.10.2 has brought messages under the keys of others, a dozen at once, after a process had stood still for a
-second (`tools/misdeliveries.py`): an agent's path as that of another one. So each message bears a mark of the key that
-it was published under as attachment, and is dropped where it comes under another key. What bears none is delivered.
+Zenoh 1.10.2 has brought messages under the keys of others, six at once, on a machine on which processes stand still
+for a second (`tools/misdeliveries.py`): an agent's path as that of another one. So each message bears a mark of the key
+that it was published under as attachment, and is dropped where it comes under another key. What bears none is
+delivered.
 """
 
 from __future__ import annotations
