@@ -3,11 +3,6 @@
 It uses one Unix socket in a private directory, without port or discovery. Samples wait in one ring for each topic and
 sender until the tick drains them: no callback and no FIFO could block reception. `swarmctl.bus.peers` judges freshness
 from the payload; nothing here looks into a payload.
-
-Zenoh 1.10.2 has brought messages under the keys of others, six at once, on a machine on which processes stand still
-for a second (`tools/misdeliveries.py`): an agent's path as that of another one. So each message bears a mark of the key
-that it was published under as attachment, and is dropped where it comes under another key. What bears none is
-delivered.
 """
 
 from __future__ import annotations
@@ -19,14 +14,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
-from hashlib import blake2b
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from swarmctl.bus.bus import Bus
+from swarmctl.bus.marked_keys import Inbox, MarkedPublisher, drain
 from swarmctl.bus.refusals import MISDELIVERED, RefusedMessage
 from swarmctl.bus.silence import DEAF_S, SilenceWatch
 from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
@@ -46,7 +41,6 @@ _LINK_OPEN_TIMEOUT_MS = 5000  # of links between routers: one that was cut is ba
 # processor for 2 s, as in a launch on a machine under load, was deaf for good.
 _CLIENT_OPEN_TIMEOUT_MS = 60_000
 _MAX_SOCKET_PATH = 100  # sun_path is 108 bytes
-_MARK_BYTES = 8
 _MOST_REFUSED = 4096  # kept until they are asked for
 
 COMMON_SETTINGS: dict[str, Any] = {
@@ -58,60 +52,13 @@ COMMON_SETTINGS: dict[str, Any] = {
 }
 
 
-class MarkedPublisher:
-    """Publishes under one key, whose mark every message bears; messages are dropped where the queue is full.
-
-    Args:
-        session: of Zenoh.
-        key: to publish under.
-        reliable: sent again where a link loses it.
-    """
-
-    def __init__(self, session: Any, key: str, *, reliable: bool) -> None:
-        reliability = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
-        self._mark = _mark_of(key)
-        self._publisher = session.declare_publisher(
-            key, congestion_control=zenoh.CongestionControl.DROP, reliability=reliability
-        )
-
-    def put(self, payload: bytes) -> None:
-        """Pass a message to the session."""
-        self._publisher.put(payload, attachment=self._mark)
-
-    def undeclare(self) -> None:
-        """Publish nothing more."""
-        self._publisher.undeclare()
-
-
-class _Inbox:
-    """Receives what is published under one key."""
-
-    def __init__(self, session: Any, key: str, ring: int) -> None:
-        self._mark, self._ring = _mark_of(key), ring
-        self._subscriber = session.declare_subscriber(
-            key, zenoh.handlers.RingChannel(ring), allowed_origin=zenoh.Locality.REMOTE
-        )
-
-    def take(self) -> tuple[Sequence[Any], int]:
-        """Return the payloads that have come, and how many messages were of other keys."""
-        samples = _drain(self._subscriber, self._ring)
-        if not samples:
-            return (), 0  # from most senders nothing has come, in most ticks
-        payloads = [sample.payload for sample in samples if _bears(sample, self._mark)]
-        return payloads, len(samples) - len(payloads)
-
-    def undeclare(self) -> None:
-        """Receive nothing more."""
-        self._subscriber.undeclare()
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Joined:
     """One session, and what it has declared."""
 
     session: Any
     publishers: Mapping[Topic, MarkedPublisher]
-    subscribers: Mapping[Topic, dict[str, _Inbox]]  # by topic and sender
+    subscribers: Mapping[Topic, dict[str, Inbox]]  # by topic and sender
     tokens: Any  # subscriber of liveliness tokens
     own_token: Any
 
@@ -262,7 +209,7 @@ class ZenohBus(Bus):
                 now.pop(sender).undeclare()
             for sender in wanted:
                 if sender not in now:
-                    now[sender] = _Inbox(self._now.session, f"{self._prefix}/{sender}/{topic.name}", topic.ring)
+                    now[sender] = Inbox(self._now.session, f"{self._prefix}/{sender}/{topic.name}", topic.ring)
 
     def _is_linked(self) -> bool:
         """Return whether the session is linked to a router; the own token is not told of where it moves to another."""
@@ -272,7 +219,7 @@ class ZenohBus(Bus):
             return False  # the session is closed
 
     def _watch_tokens(self) -> None:
-        for sample in _drain(self._now.tokens, _ALIVE_RING):
+        for sample in drain(self._now.tokens, _ALIVE_RING):
             sender = str(sample.key_expr).split("/")[2]
             if sample.kind != zenoh.SampleKind.PUT:
                 self._alive -= {sender}
@@ -295,7 +242,7 @@ def _join(
         topic: MarkedPublisher(session, f"{prefix}/{me}/{topic.name}", reliable=topic.reliable) for topic in TOPICS
     }
     subscribers = {
-        topic: {sender: _Inbox(session, f"{prefix}/{sender}/{topic.name}", topic.ring) for sender in senders}
+        topic: {sender: Inbox(session, f"{prefix}/{sender}/{topic.name}", topic.ring) for sender in senders}
         for topic, senders in dict(subscriptions).items()
     }
     ring: Any = zenoh.handlers.RingChannel(_ALIVE_RING)
@@ -306,21 +253,6 @@ def _join(
         tokens=session.liveliness().declare_subscriber(f"{prefix}/*/alive", ring, history=True),
         own_token=session.liveliness().declare_token(f"{prefix}/{me}/alive"),
     )
-
-
-def is_misdelivered(sample: Any) -> bool:
-    """Tell whether a sample bears the mark of another key than the one it came under."""
-    return not _bears(sample, _mark_of(str(sample.key_expr)))
-
-
-def _bears(sample: Any, mark: bytes) -> bool:
-    attachment = sample.attachment
-    return attachment is None or bool(attachment.to_bytes() == mark)
-
-
-@cache
-def _mark_of(key: str) -> bytes:
-    return blake2b(key.encode(), digest_size=_MARK_BYTES).digest()
 
 
 def socket_file(endpoint: str) -> Path:
@@ -368,17 +300,6 @@ def open_session(settings: Mapping[str, Any]) -> Any:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return zenoh.open(config)
-
-
-def _drain(subscriber: Any, limit: int) -> list[Any]:
-    """Return at most `limit` samples, so that a flood cannot block the caller."""
-    samples: list[Any] = []
-    try:
-        while len(samples) < limit and (sample := subscriber.try_recv()) is not None:
-            samples.append(sample)
-    except zenoh.ZError:
-        return samples  # the session is closed
-    return samples
 
 
 def close_session(session: Any) -> None:

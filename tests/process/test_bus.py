@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from swarmctl.bus.marked_keys import MarkedPublisher
 from swarmctl.bus.refusals import HARMLESS, MISDELIVERED, RefusedMessage
 from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, STATUS, TICK, TOO_LONG
-from swarmctl.bus.zenoh_bus import COMMON_SETTINGS, SCHEME, MarkedPublisher, ZenohBus, close_session, open_session
+from swarmctl.bus.zenoh_bus import COMMON_SETTINGS, SCHEME, ZenohBus, close_session, open_session
 from swarmctl.errors import StartError
 
 pytestmark = pytest.mark.process
