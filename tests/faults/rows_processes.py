@@ -184,7 +184,7 @@ ROWS = (
         within_s=10.0,
         protection="the viewer is watched",
         script=viewer_stopped,
-        off=in_program("launch", SUPERVISOR + "supervisor.FlightSupervisor._watch_viewer = lambda *_: None"),
+        off=in_program("launch", "import swarmctl.ops.processes as it\nit.Child.is_stopped = lambda self: False"),
     ),
     LaunchedRow(
         name="process-launcher-killed",
@@ -214,7 +214,7 @@ ROWS = (
         name="process-ctrl-c-twice",
         event="Ctrl-C twice",
         reaction="every process ends at once, nothing is left, the run is summed up",
-        within_s=30.0,
+        within_s=12.0,
         protection="the second stop kills",
         script=a_second_ctrl_c_ends_everything_at_once,
         off=in_program("launch", SUPERVISOR + "supervisor.kill_all = lambda *_: None"),
@@ -286,7 +286,13 @@ ROWS = (
         within_s=60.0,
         protection="a router that has ended is started again",
         script=descriptors_of_the_router,
-        off=in_program(ROUTER, "import os, threading\nthreading.Timer(12.0, lambda: os._exit(1)).start()"),
+        off=Off(
+            preload=in_program(
+                ROUTER, "import os, threading\nthreading.Timer(12.0, lambda: os._exit(1)).start()"
+            ).preload
+            + "\n"
+            + in_program("launch", SUPERVISOR + "supervisor._ROUTER_STARTS = 0").preload
+        ),
     ),
     LaunchedRow(
         name="process-descriptors-launcher",

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -45,6 +50,21 @@ def test_a_process_row_holds_and_fails_without_its_protection(tmp_path: Path) ->
     ROWS["start-configuration-wrong"].play(tmp_path / "protected")
     with pytest.raises(UnmetError):
         ROWS["start-configuration-wrong"].play(tmp_path / "unprotected", protected=False)
+
+
+@pytest.mark.parametrize("row", [row for row in ROWS.values() if isinstance(row, LaunchedRow) and row.off.preload])
+def test_what_a_launched_row_switches_off_exists(row: LaunchedRow) -> None:
+    """A protection that has been renamed would be replaced by nothing, and the row hold without it."""
+    known: dict[str, Any] = {}
+    for node in ast.walk(ast.parse(row.off.preload)):
+        if isinstance(node, ast.Import):
+            known |= {name.asname: import_module(name.name) for name in node.names if name.asname}
+    for node in ast.walk(ast.parse(row.off.preload)):
+        for target in getattr(node, "targets", ()):
+            module, *names = ast.unparse(target).split(".")
+            if isinstance(target, ast.Attribute) and module in known:
+                owner = attrgetter(".".join(names[:-1]))(known[module]) if names[1:] else known[module]
+                assert hasattr(owner, names[-1]) or f"self.{names[-1]} = " in inspect.getsource(owner), names
 
 
 def test_there_are_rows_of_every_kind() -> None:
