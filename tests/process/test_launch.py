@@ -40,6 +40,8 @@ from tests.process.test_readme import low, shown
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
+AT_ONCE_S = 4.0  # a landing takes longer
+
 
 def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     (line,) = shown(r"^swarmctl launch configs/thesis")
@@ -168,6 +170,10 @@ def a_second_ctrl_c_ends_everything_at_once(start: Start) -> None:
     launched.process.send_signal(signal.SIGINT)
     time.sleep(0.5)
     launched.process.send_signal(signal.SIGINT)
+    deadline_s = time.monotonic() + AT_ONCE_S
+    while launched.relatives():
+        assert time.monotonic() < deadline_s, "they go on"
+        time.sleep(0.05)
     assert launched.end(30.0) == 130, launched.text()
     assert launched.summary()["outcome"] == "interrupted"
 
