@@ -30,6 +30,7 @@ from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US, SealedBus
 from swarmctl.bus.network.seals import TAG_BYTES, PairKeys, Sealer, SealVerifier, overhead_bytes
 from swarmctl.bus.peer_trajectories import PeerTrajectories
+from swarmctl.bus.refusals import MISDELIVERED, RefusedMessage
 from swarmctl.bus.relay import RelayingBus, encode_relay
 from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, PATH, RELAY, STATUS, TRAJECTORY, Topic
 from swarmctl.control.collision.separation import SeparationParams
@@ -441,3 +442,14 @@ def test_what_a_slower_relay_delivers_is_no_replay(folders: Folders) -> None:
     scene.carry(OTHER, RELAY, encode_relay([(1, late)]))
     scene.listen()
     assert not scene.world.refusals.by_reason
+
+
+def test_what_the_carrier_of_sealed_messages_has_refused_is_counted(
+    folders: Folders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = Scene(folders)
+    carrier = type(scene.hub.connect("agent-9", {}))
+    monkeypatch.setattr(carrier, "refused", lambda _: [RefusedMessage(VICTIM, PATH.name, MISDELIVERED)])
+    assert scene.bus.refused() == [RefusedMessage(VICTIM, PATH.name, MISDELIVERED)]
+    scene.listen()
+    assert set(scene.world.refusals.by_reason) == {MISDELIVERED}
