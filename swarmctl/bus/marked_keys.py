@@ -1,9 +1,9 @@
 """Publishes and receives under keys of Zenoh, and drops what comes under the key of another message.
 
-Zenoh 1.10.2 has brought messages under the keys of others, six at once, on a machine on which processes stand still
-for a second (`tools/misdeliveries.py`): an agent's path as that of another one. So each message bears a mark of the key
-that it was published under as attachment, and is dropped where it comes under another key. What bears none is
-delivered.
+Zenoh 1.10.2 has brought messages under the keys of others, dozens in a flight on a busy machine from which an agent was
+killed (see also `tools/misdeliveries.py`): a path as that of another agent, a status as a mission. So each message
+bears a mark of the key that it was published under as attachment, and is dropped where it comes under another key. What
+bears none is delivered.
 """
 
 from __future__ import annotations

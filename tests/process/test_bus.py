@@ -321,7 +321,7 @@ def test_who_is_heard_can_change_in_flight(join: Callable[..., ZenohBus]) -> Non
 def test_a_message_under_the_key_of_another_one_is_dropped_and_counted(
     endpoint: str, join: Callable[..., ZenohBus]
 ) -> None:
-    """Zenoh has confused keys where processes stand still: a path of one agent came as that of another one."""
+    """Zenoh has confused keys on busy machines: a path of one agent came as that of another one."""
     listener = join("agent-0", {PATH: ["agent-1"]})
     session = open_session(COMMON_SETTINGS | {"mode": "client", "connect/endpoints": [endpoint]})
     key, other = (f"swarm/run/{name}/path" for name in ("agent-1", "agent-2"))
