@@ -9,13 +9,14 @@ bears none is delivered.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import lru_cache
 from hashlib import blake2b
 from typing import Any
 
 import zenoh
 
 _MARK_BYTES = 8
+_MOST_MARKS = 4096  # that are remembered: clients of a router choose their keys
 
 
 class MarkedPublisher:
@@ -71,9 +72,9 @@ class Inbox:
         self._subscriber.undeclare()
 
 
-def is_misdelivered(sample: Any) -> bool:
+def is_misdelivered(sample: Any, key: str) -> bool:
     """Tell whether a sample bears the mark of another key than the one it came under."""
-    return not _bears(sample, _mark_of(str(sample.key_expr)))
+    return not _bears(sample, _mark_of(key))
 
 
 def _bears(sample: Any, mark: bytes) -> bool:
@@ -81,7 +82,7 @@ def _bears(sample: Any, mark: bytes) -> bool:
     return attachment is None or bool(attachment.to_bytes() == mark)
 
 
-@cache
+@lru_cache(maxsize=_MOST_MARKS)
 def _mark_of(key: str) -> bytes:
     return blake2b(key.encode(), digest_size=_MARK_BYTES).digest()
 

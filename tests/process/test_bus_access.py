@@ -207,6 +207,31 @@ def test_sealed_messages_pass_between_hosts_and_plain_ones_are_counted(swarm: Sw
             bus.close()
 
 
+def test_routers_pass_no_message_on_that_came_under_the_key_of_another_one(
+    swarm: SwarmOfHosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with swarm.router("alpha"), swarm.router("bravo"):
+        mouth, ear = swarm.plain("alpha", "agent-0"), swarm.plain("bravo", "ear", {PATH: ["agent-0"]})
+        heard: set[bytes] = set()
+
+        def say_until_heard(message: bytes) -> None:
+            deadline_s = time.monotonic() + WAIT_S
+            while message not in heard and time.monotonic() < deadline_s:
+                mouth.publish(PATH, message)
+                time.sleep(0.05)
+                heard.update(said for _, said in ear.receive(PATH))
+
+        say_until_heard(b"first")
+        with monkeypatch.context() as confused:
+            confused.setattr(mouth._now.publishers[PATH], "_mark", b"of another")
+            for _ in range(5):
+                mouth.publish(PATH, b"confused")
+        say_until_heard(b"last")
+        assert heard == {b"first", b"last"}
+        for bus in (mouth, ear):
+            bus.close()
+
+
 def test_routers_link_with_those_of_their_own_authority_only(
     swarm: SwarmOfHosts, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

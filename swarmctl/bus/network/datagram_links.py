@@ -101,11 +101,11 @@ class DatagramLinks:
             self._send(sample)
 
     def _send(self, sample: Any) -> None:
-        if is_misdelivered(sample):
+        key = str(sample.key_expr)
+        if is_misdelivered(sample, key):
             return
-        key = str(sample.key_expr).removeprefix(_PREFIX)
         with self._lock:
-            outgoing = self._routes.send(key, sample.payload.to_bytes(), time.monotonic())
+            outgoing = self._routes.send(key.removeprefix(_PREFIX), sample.payload.to_bytes(), time.monotonic())
         self._send_all(outgoing)
 
     def _send_all(self, outgoing: Outgoing) -> None:
