@@ -12,8 +12,6 @@ goes deaf. Here nothing replaces who is deaf.
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -22,19 +20,11 @@ import swarmctl.bus.zenoh_bus as zenoh_bus
 from swarmctl.bus.topics import COMMAND, STATUS
 from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
 from swarmctl.errors import StartError
+from tests.benches.router_process import start_router
 
 NEVER_S = 1e9
 CONNECTED_S = 3.0  # after a restart
 LISTEN_S = 1.5
-
-
-def start_router(endpoint: str) -> subprocess.Popen[str]:
-    """Start a router, and wait until it is ready."""
-    command = [sys.executable, "-m", "swarmctl.bus.network.router", endpoint, "--die-with-parent"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    process.stdout.readline()
-    return process
 
 
 def joined(endpoint: str, name: str) -> ZenohBus:

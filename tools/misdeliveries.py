@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.topics import PATH, STATUS, TICK, TRAJECTORY
 from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
+from tests.benches.router_process import start_router
 
 SPEAKERS, LISTENERS = [agent_name(agent) for agent in range(12)], 3
 SAID = {PATH: 632, TRAJECTORY: 900, TICK: 1500, STATUS: 2200}  # bytes, about as in flight
@@ -77,10 +78,7 @@ def main() -> None:
         {"speak": speak, "listen": listen}[role](endpoint, me, float(until_s))
         return
     endpoint = f"{SCHEME}{tempfile.mkdtemp(prefix='swarm-')}/bus.sock"
-    router = [sys.executable, "-m", "swarmctl.bus.network.router", endpoint, "--die-with-parent"]
-    with subprocess.Popen(router, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
+    with start_router(endpoint) as router:
         until_s = time.monotonic() + 60.0 * options.minutes
 
         def start(role: str, me: str) -> subprocess.Popen[str]:
@@ -92,7 +90,7 @@ def main() -> None:
         stop_in_turn(listeners, until_s - 2.0 * STOPPED_S)
         for started in (*speakers, *listeners):
             started.wait()
-        process.terminate()
+        router.terminate()
 
 
 if __name__ == "__main__":

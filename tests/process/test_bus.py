@@ -18,6 +18,7 @@ from swarmctl.bus.refusals import HARMLESS, MISDELIVERED, RefusedMessage
 from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, STATUS, TICK, TOO_LONG
 from swarmctl.bus.zenoh_bus import COMMON_SETTINGS, SCHEME, ZenohBus, close_session, open_session
 from swarmctl.errors import StartError
+from tests.benches.router_process import start_router
 
 pytestmark = pytest.mark.process
 
@@ -32,14 +33,6 @@ def until(condition: Callable[[], bool], timeout_s: float = WAIT_S) -> bool:
             return True
         time.sleep(0.02)
     return condition()
-
-
-def start_router(endpoint: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "swarmctl.bus.network.router", endpoint, "--die-with-parent"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline().startswith("router ready")
-    return process
 
 
 def end(process: subprocess.Popen[str]) -> int:

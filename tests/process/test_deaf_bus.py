@@ -24,8 +24,9 @@ from swarmctl.bus.topics import COMMAND, PATH, STATUS
 from swarmctl.bus.zenoh_bus import ZenohBus
 from swarmctl.errors import StartError
 from tests.benches.free_ports import free_ports
+from tests.benches.router_process import start_router
 from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
-from tests.process.test_bus import end, start_router
+from tests.process.test_bus import end
 
 pytestmark = pytest.mark.process
 

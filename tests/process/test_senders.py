@@ -19,7 +19,7 @@ from swarmctl.bus.senders import SILENCE_US, Presence
 from swarmctl.bus.topics import PATH
 from swarmctl.bus.zenoh_bus import ZenohBus
 from tests import builders
-from tests.process.test_bus import WAIT_S, end, endpoint, join, start_router  # noqa: F401  (fixtures)
+from tests.process.test_bus import WAIT_S, end, endpoint, join  # noqa: F401  (fixtures)
 
 pytestmark = pytest.mark.process
 
