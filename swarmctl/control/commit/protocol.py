@@ -60,7 +60,7 @@ The proof rests on these assumptions, each of which is watched in flight:
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -72,8 +72,8 @@ from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array
 
 _LATENCIES = 50  # remembered, of the newest commitments
-_PERCENTILE = 90.0
-_LEAD_FACTOR = 1.2  # the lead is this many times that percentile of the time acknowledgements take
+_QUANTILE_01 = 0.9
+_LEAD_FACTOR = 1.2  # the lead is this many times that quantile of the time acknowledgements take
 _EVASION_DELAY_S = 0.2  # braking this much after the lead must still be clear, otherwise the agent evades
 _TICK_S = 0.04  # sending and receiving take at least this long
 _NO_LAG_M_S = 0.1  # a slower trajectory is not waited on: it is at rest soon
@@ -203,7 +203,7 @@ class Commitments:
             self._late_us -= self._proposed_late_us
             self.counts.committed += 1
             self._latencies_s.append((utc_us - mine.made_utc_us) * 1e-6)
-            self._set_lead(_LEAD_FACTOR * float(np.percentile(self._latencies_s, _PERCENTILE)) + _TICK_S)
+            self._set_lead(_LEAD_FACTOR * _quantile(self._latencies_s, _QUANTILE_01) + _TICK_S)
 
     def conflicting_peers(self, utc_us: int, peers: Mapping[int, TrajectoryMessage]) -> set[int]:
         """Return peers whose committed trajectory conflicts with the own one, because one of the two had to evade.
@@ -299,3 +299,11 @@ def acknowledgements(peers: Mapping[int, TrajectoryMessage], without: Set[int]) 
         without: peers that take no part any more, or are promised to be excluded.
     """
     return {agent: i.proposal.number for agent, i in peers.items() if i.proposal is not None and agent not in without}
+
+
+def _quantile(values: Iterable[float], share_01: float) -> float:
+    """Return a quantile, linear between values as that of NumPy, which loads its masked arrays at the first call."""
+    ordered = sorted(values)
+    low, part = divmod(share_01 * (len(ordered) - 1), 1.0)
+    below, above = ordered[int(low)], ordered[min(int(low) + 1, len(ordered) - 1)]
+    return below + part * (above - below)

@@ -1,20 +1,23 @@
-"""The shortest path in the plane around discs: Dijkstra's algorithm on a grid, then shortcuts between corners.
+"""The shortest path in the plane around discs: least costs on a grid, then shortcuts between corners.
 
 Only an agent that stands before something asks for it (`swarmctl.control.reference.deadlock`): the MPC looks 0.8 s
 ahead and cannot know on which side a wall ends. Cells inside a disc are passable at a price, so there is always an
 answer, also from inside a disc and through gaps that the grid is too coarse for. Between discs that overlap there is
 no gap: who stands there already, as far from either end of it, would else try to squeeze through for ever.
+
+The costs are those of Bellman and Ford, relaxed for all cells at once. SciPy's Dijkstra takes a fifth of the time, but
+13 MB in every agent and 0.2 s of import, for something that few flights need.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
 from swarmctl.core.types import Array
 
@@ -24,6 +27,15 @@ _PRICE_INSIDE = 1000.0  # price of a metre farther inside, or outside of the sid
 _PRICE_THROUGH = 1e5  # price of a metre between two discs that overlap
 _NEAREST = 9  # cells among which that of a place is chosen
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Edges:
+    """Holds the edges of a grid in one direction: the cells they join, as two views of the same shape, and costs."""
+
+    start: tuple[slice, slice]
+    end: tuple[slice, slice]
+    costs: Array
 
 
 class Polyline:
@@ -96,24 +108,27 @@ def shortest_path(
     walls = _walls(discs)
     first, last = _nearest(points, start, walls), _nearest(points, goal, walls)
     edges = _edges(price, points, walls, shape=shape, step_m=step_m)
-    _, before = dijkstra(edges, directed=False, indices=last, return_predecessors=True)
-    cells = [first]
-    while cells[-1] != last and before[cells[-1]] >= 0:
-        cells.append(int(before[cells[-1]]))
+    cells = _cheapest(edges, shape, first, last)
     return _tightened(np.vstack([start, points[cells[1:-1]], goal]), discs)
 
 
 def clear(a: Array, b: Array, discs: Array) -> bool:
     """Tell whether the segment from `a` (2,) to `b` (2,) stays outside all discs; it may leave one it begins in."""
+    return bool(_are_clear(a, b[None], discs)[0])
+
+
+def _are_clear(a: Array, ends: Array, discs: Array) -> NDArray[np.bool_]:
+    """Tell of which of the segments from `a` (2,) to `ends` (K, 2) `clear` holds."""
     if not len(discs):
-        return True
-    step = b - a
-    length2 = max(float(step @ step), 1e-12)
+        return np.ones(len(ends), dtype=bool)
+    steps = ends - a
+    lengths2 = np.maximum((steps * steps).sum(axis=1), 1e-12)[:, None]
     from_a = discs[:, :2] - a
-    along = np.clip(from_a @ step / length2, 0.0, 1.0)
-    nearest = np.linalg.norm(from_a - along[:, None] * step, axis=1)
+    along = np.clip(steps @ from_a.T / lengths2, 0.0, 1.0)  # (K, M)
+    nearest = np.linalg.norm(from_a - along[..., None] * steps[:, None], axis=2)
     leaves = (np.linalg.norm(from_a, axis=1) < discs[:, 2]) & (along <= 0.0)
-    return bool(((nearest >= discs[:, 2]) | leaves).all())
+    found: NDArray[np.bool_] = ((nearest >= discs[:, 2]) | leaves).all(axis=1)
+    return found
 
 
 def _grid(start: Array, goal: Array, discs: Array, cell_m: float) -> tuple[Array, tuple[int, int], float]:
@@ -144,21 +159,55 @@ def _nearest(points: Array, here: Array, walls: Array) -> int:
     return int(nearest[np.argmin(beyond)])
 
 
-def _edges(price: Array, points: Array, walls: Array, *, shape: tuple[int, int], step_m: float) -> csr_array:
-    """Return edges between each cell and its eight neighbours, each edge once; those through walls are the dearest."""
-    index = np.arange(len(price)).reshape(shape)
-    starts, ends, lengths = [], [], []
+def _edges(price: Array, points: Array, walls: Array, *, shape: tuple[int, int], step_m: float) -> list[_Edges]:
+    """Return the edges between each cell and its eight neighbours, each once; those through walls are the dearest."""
+    prices, places = price.reshape(shape), points.reshape(*shape, 2)
+    found = []
     for down, right in _NEIGHBOURS:
-        starts.append(index[: shape[0] - down, max(0, -right) : shape[1] - max(0, right)].ravel())
-        ends.append(index[down:, max(0, right) : shape[1] + min(0, right)].ravel())
-        lengths.append(np.full(len(starts[-1]), step_m * math.hypot(down, right)))
-    start, end = np.concatenate(starts), np.concatenate(ends)
-    dear = np.maximum(price[start], price[end])
-    for wall in walls:
-        low, high = wall.min(axis=0) - 2.0 * step_m, wall.max(axis=0) + 2.0 * step_m
-        near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1)[start])
-        dear[near[_crosses(points[start[near]], points[end[near]], wall)]] = _PRICE_THROUGH
-    return csr_array((np.concatenate(lengths) * dear, (start, end)), shape=(len(price), len(price)))
+        start = np.s_[: shape[0] - down, max(0, -right) : shape[1] - max(0, right)]
+        end = np.s_[down:, max(0, right) : shape[1] + min(0, right)]
+        dear = np.maximum(prices[start], prices[end])
+        a, b = places[start], places[end]
+        for wall in walls:
+            near = _near(wall, a, 2.0 * step_m)
+            dear[near][_crosses(a[near], b[near], wall)] = _PRICE_THROUGH
+        found.append(_Edges(start=start, end=end, costs=step_m * math.hypot(down, right) * dear))
+    return found
+
+
+def _cheapest(edges: Sequence[_Edges], shape: tuple[int, int], first: int, last: int) -> list[int]:
+    """Return the cells of a cheapest way from cell `first` to cell `last`, both included."""
+    costs = np.full(shape, np.inf)  # to `last`
+    costs.flat[last] = 0.0
+    before = np.empty(shape)
+    while True:
+        before[...] = costs
+        for e in edges:
+            np.minimum(costs[e.start], costs[e.end] + e.costs, out=costs[e.start])
+            np.minimum(costs[e.end], costs[e.start] + e.costs, out=costs[e.end])
+        cheaper = costs[costs < before]
+        if not len(cheaper) or cheaper.min() >= costs.flat[first]:
+            break  # no way over a cell that has just become cheaper is cheaper than that of `first`
+    through = np.full((8, *shape), np.inf)  # cost over each neighbour
+    steps = np.array([down * shape[1] + right for down, right in _NEIGHBOURS])
+    for k, e in enumerate(edges):
+        through[k][e.start] = costs[e.end] + e.costs
+        through[k + 4][e.end] = costs[e.start] + e.costs
+    onward = np.concatenate([steps, -steps])[through.argmin(axis=0)].ravel()
+    cells = [first]
+    while cells[-1] != last:
+        cells.append(cells[-1] + int(onward[cells[-1]]))
+    return cells
+
+
+def _near(wall: Array, cells: Array, margin_m: float) -> tuple[slice, slice]:
+    """Return which of the cells (rows, columns, 2) of a grid are in the box around a wall (2, 2)."""
+    low, high = wall.min(axis=0) - margin_m, wall.max(axis=0) + margin_m
+    rows, columns = cells[:, 0, 0], cells[0, :, 1]
+    return (
+        slice(*np.searchsorted(rows, (low[0], high[0]))),
+        slice(*np.searchsorted(columns, (low[1], high[1]))),
+    )
 
 
 def _crosses(a: Array, b: Array, wall: Array) -> NDArray[np.bool_]:
@@ -180,6 +229,6 @@ def _tightened(points: Array, discs: Array) -> Polyline:
     kept = [0]
     while kept[-1] < len(points) - 1:
         here = kept[-1]
-        straight = [k for k in range(here + 2, len(points)) if clear(points[here], points[k], discs)]
-        kept.append(straight[-1] if straight else here + 1)
+        straight = np.flatnonzero(_are_clear(points[here], points[here + 2 :], discs))
+        kept.append(here + 2 + int(straight[-1]) if len(straight) else here + 1)
     return Polyline(points[kept])

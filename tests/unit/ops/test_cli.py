@@ -89,9 +89,10 @@ def test_an_agent_loads_nothing_more_once_it_is_made(mode: str) -> None:
         before = set(sys.modules)
         flight.run()
         assert not flight.problems()
-        print(sorted(set(sys.modules) - before))"""
+        print(sorted(set(sys.modules) - before))
+        print([name for name in ("scipy", "osqp") if name in sys.modules])"""
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert answer.stdout.strip() == "[]"
+    assert answer.stdout.split() == ["[]", "[]"]  # SciPy and OSQP are 20 to 30 MB more in each agent that uses DAQP
 
 
 @pytest.mark.parametrize(
