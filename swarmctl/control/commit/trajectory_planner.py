@@ -419,6 +419,7 @@ def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
             "horizon_z": params.horizon,
             "control_xy": params.moves,
             "horizon_xy": params.horizon,
+            "blocking_xy": "none",
             "u_max": params.tilt_fraction_01 * mpc.u_max,
             "thrust_min_m_s2": max(mpc.thrust_min_m_s2, 0.7 * GRAVITY_M_S2),
             "thrust_max_m_s2": min(mpc.thrust_max_m_s2, 1.4 * GRAVITY_M_S2),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarmctl.control.lag import Lag
 from swarmctl.core.types import Array
@@ -45,6 +46,22 @@ class Horizon:
     dt_s: float
     euler: bool  # forward Euler as in the thesis (3.6), otherwise exact for a held input
     drag_1_s: float = 0.0
+    spread: bool = False  # increments over the whole horizon, farther and farther apart; else at its first steps
+
+    def starts(self) -> NDArray[np.intp]:
+        """Return the steps (Hc,) over which an input begins to act: move blocking (Cagienard et al. 2007).
+
+        Those that are spread grow with the square of their number: near ones are as close as steps allow, and the last
+        ones far enough apart to reach the end.
+        """
+        moves = np.arange(self.control)
+        if not self.spread or self.control >= self.prediction:
+            return moves
+        return np.maximum(moves, np.rint(self.prediction * (moves / self.control) ** 2).astype(np.intp))
+
+    def blocks(self) -> Array:
+        """Return over how many steps (Hc,) an increment may be made: those from the one before on, 1 for the first."""
+        return np.diff(self.starts(), prepend=-1).astype(float)
 
     def t_s(self) -> Array:
         """Return times (Hp,) [s] of steps 1..Hp."""
@@ -52,8 +69,7 @@ class Horizon:
 
     def held(self) -> Array:
         """Return inputs (Hp, Hc) over each step, due to a unit increment at each control step."""
-        steps, moves = np.arange(self.prediction), np.arange(self.control)
-        return np.asarray(np.minimum.outer(steps, moves) == moves, np.float64)
+        return np.asarray(np.arange(self.prediction)[:, None] >= self.starts(), np.float64)
 
     def of_velocity_s(self) -> tuple[Array, Array]:
         """Return displacement (Hp,) [s] and velocity (Hp,) [1] at steps 1..Hp, due to a unit velocity at the start."""

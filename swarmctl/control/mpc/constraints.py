@@ -49,9 +49,9 @@ class InputBounds(ConstraintBlock):
         super().__init__(np.kron(np.eye(len(prediction.axes)), np.tri(prediction.horizon.control)).astype(bool))
 
     def prepare(self, rows: Rows) -> None:
-        for i, axis in enumerate(self._prediction.axes):
+        for i, (axis, du_max) in enumerate(zip(self._prediction.axes, self._prediction.du_max, strict=True)):
             own = self._prediction.columns(i)
-            rows.moves[own, own] = np.tri(self._prediction.horizon.control) * axis.du_max / axis.u_scale
+            rows.moves[own, own] = np.tri(len(du_max)) * du_max / axis.u_scale
 
     def fill(self, rows: Rows, forecast: Forecast) -> None:
         for (own, u_min, u_max, u_scale), held in zip(self._bounds, forecast.u_prev.tolist(), strict=True):
@@ -88,7 +88,7 @@ class TerminalConditions(ConstraintBlock):
         for j, (i, what) in enumerate(self._ends):
             response = (forecast.pos_response if what == "pos" else forecast.vel_response)[i, -1]
             both = slice(2 * j, 2 * j + 2)
-            rows.moves[both, self._prediction.columns(i)] = self._prediction.axes[i].du_max * response
+            rows.moves[both, self._prediction.columns(i)] = self._prediction.du_max[i] * response
             asked = self._wanted(j, forecast)
             least, most = sorted(float(response @ increments) for increments in extremes[:, i])
             rows.lower[both], rows.upper[both] = -INFINITY, INFINITY
@@ -155,7 +155,7 @@ class KeepOutHalfSpaces(ConstraintBlock):
         response = np.append(response, response[-1])  # the stopping row
         self._row_scale = 1.0 / np.maximum(response, 0.01)  # rows of about unit size suit a first-order solver
         self._scale = np.tile(self._row_scale, max_keep_outs)  # of all rows
-        self._unit = (prediction.du_max[:, None] * self._row_scale)[:, None, :, None]  # (axes, 1, checks, 1)
+        self._unit = prediction.du_max[:, None, None] * self._row_scale[:, None]  # (axes, 1, checks, Hc)
         uses = np.ones((max_keep_outs * len(response), len(axes) * prediction.horizon.control), bool)
         slacks = np.kron(np.eye(max_keep_outs), (_SLACK_SCALE_M * self._row_scale)[:, None])
         curvature = 2 * penalties.slack_quadratic * _SLACK_SCALE_M**2 * cost_scale
@@ -232,7 +232,7 @@ class VolumeFaces(ConstraintBlock):
         response = (prediction.pos_of_accel @ prediction.acted[0])[self._steps].max(axis=1)
         response += usual_s * (prediction.vel_of_accel @ prediction.acted[0])[self._steps].max(axis=1)
         self._scale = 1.0 / np.maximum(response * step_m_s2, 0.01)  # (rows of a face,) as in `KeepOutHalfSpaces`
-        self._unit = (prediction.du_max[:, None] * self._scale)[:, None, :, None]  # (axes, 1, checks, 1)
+        self._unit = prediction.du_max[:, None, None] * self._scale[:, None]  # (axes, 1, checks, Hc)
         self._normals = faces.normals.T[:, :, None, None]  # (axes, faces, 1, 1)
         self._steepest = float(self._scale[len(positions) - 1])  # increments per metre of the last position
         uses = np.repeat(np.repeat(faces.normals != 0.0, len(self._steps), axis=0), prediction.horizon.control, axis=1)

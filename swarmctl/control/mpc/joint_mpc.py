@@ -60,7 +60,7 @@ class JointMpc:
         def joint(room: int) -> CondensedMpc:
             return CondensedMpc(
                 (*params.horizontal(vehicle), params.vertical()),
-                params.horizon(params.control_xy, params.horizon_xy, vehicle),
+                params.horizon_of_xy(vehicle),
                 room,
                 separation.relax_01,
                 penalties=Penalties(),

@@ -1,7 +1,7 @@
 """The prediction of a condensed MPC: positions and velocities over the horizon, due to increments of the inputs.
 
-Every axis obeys `p'' = gain(k) a + drift - drag p'`, where `a` is the input u or, with a lag, what follows it. After
-the control horizon Hc the input is constant.
+Every axis obeys `p'' = gain(k) a + drift - drag p'`, where `a` is the input u or, with a lag, what follows it. Between
+the Hc steps at which it may change, and after them, the input is constant.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ class Prediction:
         self.axes, self.horizon = axes, horizon
         self.u_min = np.array([a.u_min for a in axes])
         self.u_max = np.array([a.u_max for a in axes])
-        self.du_max = np.array([a.du_max for a in axes])
+        self.du_max = np.array([a.du_max * horizon.blocks() for a in axes])  # (axes, Hc)
         self.pos_of_accel, self.vel_of_accel = horizon.of_acceleration()  # (Hp, Hp) each
         self._of_accel = np.stack([self.pos_of_accel, self.vel_of_accel])  # (2, Hp, Hp)
         self._of_vel = np.stack(horizon.of_velocity_s())[:, :, None]  # (2, Hp, 1)
         self.hold = horizon.held()  # (Hp, Hc) inputs of a unit increment
         like = np.ones((len(axes), horizon.control + 1))  # operands of one shape are quicker than broadcast ones
-        self._least, self._most, self._step = (bound[:, None] * like for bound in (self.u_min, self.u_max, self.du_max))
-        ramps = self._step * np.arange(horizon.control + 1)
+        self._least, self._most = (bound[:, None] * like for bound in (self.u_min, self.u_max))
+        ramps = np.array([a.du_max for a in axes])[:, None] * np.append(0.0, horizon.blocks().cumsum())
         self._ramps = np.stack([ramps, -ramps])  # (2, axes, Hc+1) from the held input on
         self._has_lag = any(a.lag is not None for a in axes)
         self._lags = [lag_response(a.lag, horizon.dt_s, horizon.prediction) for a in axes]
@@ -151,7 +151,7 @@ class Prediction:
         if x is None:
             return np.zeros(shape)
         moves = x[: shape[0] * shape[1]].reshape(shape)
-        wanted = np.minimum(np.maximum(moves, -1.0), 1.0) * self._step[:, 1:]
+        wanted = np.minimum(np.maximum(moves, -1.0), 1.0) * self.du_max
         inputs = u_prev[:, None] + wanted.cumsum(axis=1)
         inputs = np.minimum(np.maximum(inputs, self._least[:, 1:]), self._most[:, 1:])
         inputs[:, 1:] -= inputs[:, :-1]
@@ -160,4 +160,4 @@ class Prediction:
 
     def scaled(self, increments: Array) -> Array:
         """Return increments (axes, Hc) as variables (moves,) of the program."""
-        return np.asarray(increments / self._step[:, 1:]).ravel()
+        return np.asarray(increments / self.du_max).ravel()

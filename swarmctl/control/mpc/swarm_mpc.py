@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -49,6 +50,7 @@ class MpcParams(Params):
     horizon_z: int = Field(40, ge=2, le=200)  # predicted steps
     control_xy: int = Field(6, ge=1, le=50)  # and of dmpc3, for all three axes
     horizon_xy: int = Field(40, ge=2, le=200)  # predicted steps, also those of a shared path
+    blocking_xy: Literal["none", "spread"] = "none"  # changes at the first steps (thesis), or over the whole horizon
     z: AxisWeights = AxisWeights(q_pos=2.0, q_vel=0.05, r=1.0)  # thesis r 0.01 leaves x-y no thrust in fast climbs
     x: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
     y: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
@@ -108,8 +110,15 @@ class MpcParams(Params):
             lag=vehicle.lag(),
         )
 
-    def horizon(self, control: int, prediction: int, vehicle: VehicleModelParams) -> Horizon:
-        """Return the horizon with `control` and `prediction` steps, under the vehicle's drag."""
+    def horizon_of_z(self, vehicle: VehicleModelParams) -> Horizon:
+        """Return the horizon of the z problem, under the vehicle's drag."""
+        return self._horizon(self.control_z, self.horizon_z, vehicle)
+
+    def horizon_of_xy(self, vehicle: VehicleModelParams) -> Horizon:
+        """Return the horizon of the x-y problem, and of all three axes in one, under the vehicle's drag."""
+        return replace(self._horizon(self.control_xy, self.horizon_xy, vehicle), spread=self.blocking_xy == "spread")
+
+    def _horizon(self, control: int, prediction: int, vehicle: VehicleModelParams) -> Horizon:
         return Horizon(
             control=control,
             prediction=prediction,
@@ -145,7 +154,7 @@ class SwarmMpc:
         self.longest = max(params.horizon_xy, params.horizon_z)  # reference steps needed
         self._z = CondensedMpc(
             (params.vertical(),),
-            params.horizon(params.control_z, params.horizon_z, vehicle),
+            params.horizon_of_z(vehicle),
             0,
             1.0,
             penalties=Penalties(),
@@ -157,7 +166,7 @@ class SwarmMpc:
         def across(room: int) -> CondensedMpc:
             return CondensedMpc(
                 params.horizontal(vehicle),
-                params.horizon(params.control_xy, params.horizon_xy, vehicle),
+                params.horizon_of_xy(vehicle),
                 room,
                 separation.relax_01,
                 penalties=Penalties(),

@@ -26,12 +26,13 @@ class TrackingCost:
         self._own, hc = [prediction.columns(i) for i in range(len(axes))], prediction.horizon.control
         self._moves = np.arange(hc)
         like, square = np.ones((len(axes), hc)), np.ones((len(axes), hc, hc))  # quicker than broadcast operands
+        du_max = prediction.du_max
         weights = np.array([[a.q_pos for a in axes], [a.q_vel for a in axes]])  # (2, axes)
         self._slope_weight, self._weight = weights[:, :, None] * like, weights[:, :, None, None] * square
-        self._r = np.array([a.r * np.eye(hc) for a in axes])  # (axes, Hc, Hc)
+        self._r = np.array([np.diag(a.r / prediction.horizon.blocks()) for a in axes])  # (axes, Hc, Hc), as if ramped
         self._proximal = np.array([a.proximal for a in axes])[:, None] * like  # (axes, Hc)
-        self._slope_factor = np.array([2.0 * a.du_max * self.scale for a in axes])[:, None] * like
-        self._factor = np.array([2.0 * a.du_max**2 * self.scale for a in axes])[:, None, None] * square
+        self._slope_factor = 2.0 * du_max * self.scale  # (axes, Hc)
+        self._factor = 2.0 * (du_max[:, :, None] * du_max[:, None, :]) * self.scale  # (axes, Hc, Hc)
 
     def _region(self, axis: Axis) -> TerminalRegion:
         """Return the terminal region of an axis, in units of acceleration."""
@@ -79,7 +80,7 @@ class TrackingCost:
         curvature = self._factor * (curvature + self._r)
         pull = self._slope_factor * pull
         if (before := forecast.asked.before) is not None:
-            weight = self._proximal * self._factor[:, 0]
+            weight = self._proximal * self._factor[:, self._moves, self._moves]
             curvature[:, self._moves, self._moves] += weight
             pull -= weight * before
         for i, own in enumerate(self._own):

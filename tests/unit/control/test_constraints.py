@@ -58,7 +58,7 @@ def filled(ahead: Prediction, block: ConstraintBlock, step: Forecast) -> Rows:
 
 def flown(ahead: Prediction, step: Forecast, moves: Array) -> Array:
     """Positions and velocities (2, Hp, 2) under scaled increments (moves,)."""
-    increments = moves.reshape(2, HORIZON.control).T * ahead.du_max  # (Hc, 2)
+    increments = (moves.reshape(2, HORIZON.control) * ahead.du_max).T  # (Hc, 2)
     accel = -9.81 * (step.u_prev + ahead.hold @ increments) + step.asked.drift_m_s2
     return ahead.motion(step.asked.pos_m, step.asked.vel_m_s, accel)
 
@@ -80,7 +80,7 @@ def test_increments_are_bounded_by_one() -> None:
 def test_rows_of_inputs_hold_exactly_where_inputs_are_in_their_bounds(seed: int) -> None:
     ahead = prediction()
     rows, moves = filled(ahead, InputBounds(ahead), forecast(ahead)), some_moves(seed)
-    u = U_PREV + np.cumsum(moves.reshape(2, -1).T * ahead.du_max, axis=0)  # (Hc, 2)
+    u = U_PREV + np.cumsum((moves.reshape(2, -1) * ahead.du_max).T, axis=0)  # (Hc, 2)
     value = rows.moves @ moves
     np.testing.assert_array_equal((value >= rows.lower) & (value <= rows.upper), ((u >= -0.2) & (u <= 0.15)).T.ravel())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from swarmctl.control.mpc.axes import AxesProblem, HalfSpaces, Horizon
 from swarmctl.control.mpc.condensed import CondensedMpc
 from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.core.types import Array
-from tests.benches.condensed_problems import AXIS, GAIN, HORIZON, held, mpc, simulate
+from tests.benches.condensed_problems import AXIS, GAIN, HORIZON, mpc, simulate
 
 FIELDS = ("normal", "offset_m", "stop_s", "stop_offset_m")
 
@@ -47,15 +48,23 @@ def dense(
     ref: Array,
     spaces: HalfSpaces | None,
     rows: NDArray[np.intp],
+    starts: Sequence[int] | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Hard-constrained optimum by SLSQP on simulated motion: inputs, positions, velocities (Hp, 2)."""
+    """Hard-constrained optimum by SLSQP on simulated motion: inputs, positions, velocities (Hp, 2).
+
+    Inputs may change at `starts` (the first steps, where None), by as much as in the steps since the change before.
+    """
     horizon, axes = problem.prediction.horizon, problem.prediction.axes
     hc, hp = horizon.control, horizon.prediction
+    starts = range(hc) if starts is None else starts
+    steps = [now - before for before, now in zip((-1, *starts), starts, strict=False)]
 
     def motion(moves: Array) -> tuple[Array, Array, Array]:
         columns = []
         for i, part in enumerate(moves.reshape(len(axes), hc)):
-            u = held(part, float(u_prev[i]), hp)
+            u = np.full(hp, u_prev[i])
+            for start, increment in zip(starts, part, strict=True):
+                u[start:] += increment
             columns.append((u, *simulate(float(pos[i]), float(vel[i]), u, gain, 0.0, horizon.dt_s, horizon.euler)))
         return tuple(np.stack(c, axis=1) for c in zip(*columns, strict=True))  # type: ignore[return-value]
 
@@ -64,12 +73,12 @@ def dense(
         total = 0.0
         for i, axis in enumerate(axes):
             total += axis.q_pos * float(np.sum((p[:, i] - ref[i]) ** 2)) + axis.q_vel * float(np.sum(v[:, i] ** 2))
-            total += axis.r * float(np.sum(moves.reshape(len(axes), hc)[i] ** 2))
+            total += axis.r * float(np.sum(moves.reshape(len(axes), hc)[i] ** 2 / steps))
         return total
 
     def inside(moves: Array) -> Array:
         u, p, v = motion(moves)
-        parts = [(0.2 - u[:hc]).ravel(), (0.2 + u[:hc]).ravel()]
+        parts = [(0.2 - u[list(starts)]).ravel(), (0.2 + u[list(starts)]).ravel()]
         if spaces is not None:
             for s in range(len(spaces.normal)):
                 gap = np.einsum("kc,kc->k", spaces.normal[s], p) - spaces.offset_m[s]
@@ -83,7 +92,7 @@ def dense(
         cost,
         np.zeros(len(axes) * hc),
         method="SLSQP",
-        bounds=[(-a.du_max, a.du_max) for a in axes for _ in range(hc)],
+        bounds=[(-a.du_max * taken, a.du_max * taken) for a in axes for taken in steps],
         constraints=[{"type": "ineq", "fun": inside}],
         options={"maxiter": 300, "ftol": 1e-12},
     )
@@ -101,6 +110,7 @@ def wall(normal: tuple[float, float], offset_m: float, steps: int, stop_s: float
     )
 
 
+@pytest.mark.parametrize("starts", [None, (0, 1, 4, 9, 16)], ids=["first steps", "spread"])
 @pytest.mark.parametrize("gain", [np.full(25, GAIN), np.linspace(-5.0, -15.0, 25)], ids=["same", "varying"])
 @pytest.mark.parametrize("euler", [False, True])
 @pytest.mark.parametrize(
@@ -108,14 +118,14 @@ def wall(normal: tuple[float, float], offset_m: float, steps: int, stop_s: float
     [
         ((-1.0, 0.0), -0.08, 0.0),  # stay south of 0.08 m while the reference is 0.5 m north
         ((-1.0, -1.0), -0.09, 0.0),  # oblique: slides along
-        ((-1.0, 0.0), -0.12, 0.3),  # the stopping row decides
+        ((-1.0, 0.0), -0.1, 0.4),  # the stopping row decides
         ((0.0, 1.0), -5.0, 0.0),  # never active
     ],
 )
 def test_half_spaces_against_a_dense_solver(
-    euler: bool, normal: tuple[float, float], offset_m: float, stop_s: float, gain: Array
+    euler: bool, normal: tuple[float, float], offset_m: float, stop_s: float, gain: Array, starts: Sequence[int] | None
 ) -> None:
-    horizon = Horizon(control=5, prediction=25, dt_s=0.02, euler=euler)
+    horizon = Horizon(control=5, prediction=25, dt_s=0.02, euler=euler, spread=starts is not None)
     problem = mpc(AXIS, replace(AXIS, q_pos=1.0), horizon=horizon, max_keep_outs=2)
     pos, vel, u_prev, ref = np.array([0.0, 0.0]), np.array([0.2, 0.1]), np.array([0.01, -0.02]), np.array([0.5, 0.3])
     spaces = wall(normal, offset_m, 25, stop_s)
@@ -129,7 +139,7 @@ def test_half_spaces_against_a_dense_solver(
         ref_vel_m_s=np.zeros((25, 2)),
     )
     ours = problem.solve(tick, spaces)
-    u, p, _ = dense(problem, pos, vel, u_prev, gain, ref, spaces, problem.prediction.checked)
+    u, p, _ = dense(problem, pos, vel, u_prev, gain, ref, spaces, problem.prediction.checked, starts)
     np.testing.assert_allclose(ours.pos_m, p, atol=5e-4)
     np.testing.assert_allclose(ours.u, u, atol=3e-3)
     assert ours.slack_m < 1e-3

@@ -94,6 +94,13 @@ class Scenario:
 _JITTER_M = 0.05
 _SPEED_M_S, _ACCEL_M_S2 = 2.0, 1.2
 _SMALL_M_S, _SMALL_M_S2 = 1.0, 1.0
+_FAST_M_S, _FAST_M_S2 = 6.0, 4.0
+_AGILE = (
+    "controller.mpc.blocking_xy=spread",
+    "controller.mpc.control_xy=10",
+    "controller.mpc.du_max=0.1",
+    "controller.mpc.thrust_max_m_s2=18.0",
+)
 _COLUMN_M = 0.3  # radius of a tree
 _POST_RADIUS_M = 0.15
 _HULL_MARGIN_M = 0.15  # planned between a small vehicle's hull and a surface; plans are certified to 0.1 m less
@@ -144,6 +151,13 @@ def _symmetric(rng: np.random.Generator, agents: int) -> Layout:
 
 def _wide_swap(rng: np.random.Generator, agents: int) -> Layout:
     return _swap(rng, agents, least_m=7.0, apart_m=_GUSTY_M)
+
+
+def _fast_swap(rng: np.random.Generator, agents: int) -> Layout:
+    layout = _swap(rng, agents, least_m=10.0, apart_m=X500.radius_m)
+    assert layout.goals_ned_m is not None
+    fast = _go(layout.goals_ned_m, _FAST_M_S, _FAST_M_S2)
+    return replace(layout, size=X500, settings=(*fast, *_AGILE))
 
 
 def _random(rng: np.random.Generator, agents: int) -> Layout:
@@ -253,6 +267,9 @@ SCENARIOS: dict[str, Scenario] = {
     "symmetric": Scenario(title="the same from a perfect polygon", draw=_symmetric, agents=(6, 10), needs=2),
     "wide_swap": Scenario(
         title="a swap on a circle of 7 m or more, with room for what gusts need", draw=_wide_swap, agents=(6,), needs=2
+    ),
+    "fast_swap": Scenario(
+        title="a swap of x500s at 6 m/s, on a circle of 10 m or more", draw=_fast_swap, agents=(8,), needs=2
     ),
     "random": Scenario(
         title="random transitions in 3 x 3 x 2 m, small vehicles", draw=_random, agents=(4, 10, 20), alone=True
