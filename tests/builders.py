@@ -11,7 +11,7 @@ import numpy as np
 
 from swarmctl.bus.messages.json_messages import StatusMessage
 from swarmctl.control.collision.separation import KeepOut
-from swarmctl.control.commit.trajectory_planner import DesiredReference, Situation
+from swarmctl.control.commit.situation import DesiredReference, Situation
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage

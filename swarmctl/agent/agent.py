@@ -349,7 +349,7 @@ class Agent:
             peers=self._world_model.peers,
             excused=self._world_model.excused,
             others_ned_m=others_ned_m,
-            obstacles=self._world_model.obstacles_at_rest,
+            obstacles=self._world_model.obstacles.at_rest,
             arm_in=None if autopilot.dialect is None else autopilot.dialect.arm_in,
             boots=autopilot.clock.boots,
             refusal=self._vehicle_setup.refusal if phase <= Phase.ARM else "",

@@ -15,7 +15,8 @@ from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.sharing.interest import Interest
 from swarmctl.agent.sharing.telemetry_publisher import TelemetryPublisher
-from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner, following
+from swarmctl.control.commit.commit_params import following
+from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver

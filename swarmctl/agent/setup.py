@@ -10,7 +10,7 @@ from pydantic import Field
 from swarmctl.agent.sharing.path_sharing import PathSharingParams
 from swarmctl.control.collision.barrier import BarrierParams
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.commit.trajectory_planner import CommitParams
+from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.estimation.disturbance import DisturbanceParams
 from swarmctl.control.estimation.state_filter import StateFilterParams

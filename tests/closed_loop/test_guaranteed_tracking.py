@@ -15,9 +15,9 @@ from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.config import load
 from swarmctl.control.collision.barrier import Barrier, BarrierParams, Body
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.commit import trajectory_planner
+from swarmctl.control.commit import commit_params
+from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.protocol import Commitments
-from swarmctl.control.commit.trajectory_planner import CommitParams
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import Array, Phase
 from tests.benches.guaranteed_trials import GUARANTEED_SWAP, TUBE_M, events, flown
@@ -131,7 +131,7 @@ def test_the_committed_trajectory_is_tracked_in_height_too(
     weights: str, moves: int, follows: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Into a climbing circle from rest; control: the thesis' soft z, which is good enough for a desired reference."""
-    monkeypatch.setattr(trajectory_planner, "_FOLLOWING_MOVES_Z", moves)
+    monkeypatch.setattr(commit_params, "_FOLLOWING_MOVES_Z", moves)
     sets = ["swarm.agents=1", "sitl.start=air", "separation.mode=guaranteed", "mission.duration_s=2.5"]
     sets += [f"agent.commit.follow_z={weights}"] * bool(weights)
     flight = Lockstep(load(None, sets))

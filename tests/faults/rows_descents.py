@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from swarmctl.agent.sensing.known_obstacles import KnownObstacles
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.sharing.path_publisher import PathPublisher
 from swarmctl.core.obstacle import Obstacle
@@ -24,7 +25,7 @@ ABOVE_GUARANTEED = (*ABOVE, "separation.mode=guaranteed")
 _LONG_ENOUGH_S = 10.0  # to come past the other one
 _PX4_CUSTOM_MODE, _AUTO, _AUTO_LAND = 1.0, 4.0, 6.0
 BY_PHASE_ALONE = Off(patches=((WorldModel, "_flies_in", lambda *_: False),))
-IGNORES_OBSTACLES = Off(patches=((WorldModel, "obstacles_at_rest", lambda *_: []),))
+IGNORES_OBSTACLES = Off(patches=((KnownObstacles, "at_rest", lambda *_: []),))
 SHARES_STALE_STATES = Off(patches=((PathPublisher, "_is_recent", lambda *_: True),))
 OVER_A_BALL = (  # one hovers from the ground, five metres above the origin
     *COARSE,

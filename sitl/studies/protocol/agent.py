@@ -20,9 +20,10 @@ from sitl.studies.protocol.symbols import (
     places_of,
     trajectory_of,
 )
+from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import Commitments, acknowledgements
-from swarmctl.control.commit.trajectory_planner import CommitParams, Situation
+from swarmctl.control.commit.situation import Situation
 from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
 
 AGENTS = 3

@@ -9,7 +9,7 @@ from sitl.studies.protocol.agent import RESTARTS, TAKEN_OVER, Rules, Scope
 from sitl.studies.protocol.symbols import SymbolicPlanner
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import Commitments
-from swarmctl.control.commit.trajectory_planner import Situation
+from swarmctl.control.commit.situation import Situation
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Exclusions, TrajectoryMessage
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from swarmctl.control.commit.trajectory_planner import DesiredReference, Situation
+from swarmctl.control.commit.situation import DesiredReference, Situation
 from swarmctl.core.trajectory import Trajectory, resting
 from swarmctl.core.types import Array
 

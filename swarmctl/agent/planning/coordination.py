@@ -16,15 +16,11 @@ from swarmctl.bus.peer_trajectories import PeerTrajectories
 from swarmctl.bus.relay import missed_by_peers
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
+from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments, acknowledgements
-from swarmctl.control.commit.trajectory_planner import (
-    CommitParams,
-    DesiredReference,
-    Situation,
-    TrajectoryPlanner,
-    slowed,
-)
+from swarmctl.control.commit.situation import DesiredReference, Situation, slowed
+from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.commit.tube import Grip, Tube
 from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage

@@ -119,7 +119,7 @@ class Planner:
             self._references.reset(now_us)
             return
         known = (*keep_outs, *self.directive.lost_peer_keep_outs)
-        landmarks = self._world_model.landmarks
+        landmarks = self._world_model.obstacles.landmarks
         deadlock = self._references.update(now_us, self._utc_of_us(now_us), state.pos_ned_m, known, landmarks=landmarks)
         if deadlock is not None:
             self._alerts.put("deadlock", f"deadlocked by {deadlock.names}", now_us)

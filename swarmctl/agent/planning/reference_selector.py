@@ -9,7 +9,7 @@ import numpy as np
 
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.control.collision.separation import KeepOut
-from swarmctl.control.commit.trajectory_planner import DesiredReference
+from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.control.reference.approach import approached
 from swarmctl.control.reference.deadlock import Deadlock, DeadlockRecovery

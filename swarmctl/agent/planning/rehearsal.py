@@ -12,7 +12,8 @@ import numpy as np
 
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOuts
-from swarmctl.control.commit.trajectory_planner import DesiredReference, Situation, TrajectoryPlanner
+from swarmctl.control.commit.situation import DesiredReference, Situation
+from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.core.trajectory import resting

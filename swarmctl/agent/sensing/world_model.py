@@ -6,20 +6,15 @@ import math
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 
+from swarmctl.agent.sensing.known_obstacles import KnownObstacles
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.json_messages import (
-    ListedObstacle,
-    ObstaclesMessage,
-    StatusMessage,
-    decode_obstacles,
-    decode_status,
-)
+from swarmctl.bus.messages.json_messages import StatusMessage, decode_status
 from swarmctl.bus.messages.path_messages import stamp_us
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import PeerPaths, peer_verifiers
-from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
+from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage
 from swarmctl.bus.vouched_ends import VouchedEnds
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
@@ -33,7 +28,6 @@ from swarmctl.control.collision.separation import (
 )
 from swarmctl.control.estimation.constant_velocity import CREEP_M_S
 from swarmctl.control.phases.inputs import PeerInputs
-from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
@@ -87,8 +81,7 @@ class WorldModel:
         self._unresponsive_since_us: dict[int, int] = {}
         self._status: dict[int, StatusMessage] = {}
         self._status_us: dict[int, int] = {}  # UTC of the newest one's arrival
-        self._listed: ObstaclesMessage | None = None  # the newest list of obstacles
-        self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by number
+        self.obstacles = KnownObstacles(note)
 
     def receive(self, utc_us: int) -> list[Order]:
         """Process everything that has arrived; returns the operator's orders to this agent."""
@@ -98,7 +91,8 @@ class WorldModel:
         for sender, payload in self._bus.receive(topics.STATUS):
             self._take_status(sender, payload, utc_us)
         for sender, payload in self._bus.receive(topics.OBSTACLES):
-            self._take_obstacles(sender, payload, utc_us)
+            if refusal := self.obstacles.take(payload):
+                self.refusals.add(sender, topics.OBSTACLES.name, refusal, utc_us)
         orders = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
         for sender, payload in self._bus.receive(topics.ENDED):
             self._take_end(sender, payload, utc_us)
@@ -147,21 +141,6 @@ class WorldModel:
             ReceivedMessage(status.boot_id, status.ticks, status.utc_us, payload), utc_us
         ):
             self._status[status.agent], self._status_us[status.agent] = status, utc_us
-
-    def _take_obstacles(self, sender: str, payload: bytes, utc_us: int) -> None:
-        message, known = decode_obstacles(payload), self._listed
-        if message is None:
-            self.refusals.add(sender, topics.OBSTACLES.name, MALFORMED, utc_us)
-        elif message.proposed:
-            return  # whoever keeps the list on this computer repeats it when it is adopted
-        elif known is None or message.replaces(known) or message.corrects(known):
-            if message.obstacles != self._obstacles:
-                self._note("obstacles_changed", version=message.version, listed=payload.decode(errors="replace"))
-            before, now = ({item.without_time for item in listed} for listed in (self._obstacles, message.obstacles))
-            self._seen = {number: obstacle for number, obstacle in before & now if number in self._seen}
-            self._listed = message
-        elif message.is_too_far_from(known):
-            self.refusals.add(sender, topics.OBSTACLES.name, SEQUENCE, utc_us)
 
     def _watch_unresponsive(self, utc_us: int) -> None:
         """Report peers that are on the bus but whose paths have not been accepted for too long."""
@@ -218,20 +197,10 @@ class WorldModel:
             )
             for path, points in zip(paths, () if places is None else places, strict=True)
         ]
-        seen = self._visible(pos_ned_m, t0_utc_us)
+        seen = self.obstacles.see(pos_ned_m, t0_utc_us)
         if not seen:
             return KeepOuts(found, places)
-        self._seen.update(seen)
         return KeepOuts(found + [keep_out_of_obstacle(o, dt_us, steps, params, number=n) for n, o in seen.items()])
-
-    @property
-    def _obstacles(self) -> tuple[ListedObstacle, ...]:
-        return () if self._listed is None else self._listed.obstacles
-
-    def _visible(self, pos_ned_m: Array, utc_us: int) -> dict[int, Obstacle]:
-        """Return the obstacles that are visible from a position (3,), as they are at a time, by number."""
-        there = {item.number: item.at(utc_us) for item in self._obstacles}
-        return {number: o for number, o in there.items() if o.distance_m(pos_ned_m) < o.visibility_m}
 
     def deviating_peers(self, messages: Mapping[int, TrajectoryMessage], utc_us: int, allowed_m: float) -> set[int]:
         """Return peers whose recent path deviates by more than `allowed_m` from all trajectories they committed to."""
@@ -244,22 +213,6 @@ class WorldModel:
             if all(math.dist(here, trajectory.at(at_us)[0]) > allowed_m for trajectory in message.followed):
                 found.add(path.agent)
         return found
-
-    def landmarks(self) -> list[Obstacle]:
-        """Return obstacles at rest that have been visible so far."""
-        return [o for o in self._seen.values() if not o.moves]
-
-    def obstacles_at_rest(self, pos_ned_m: Array) -> list[Obstacle]:
-        """Return obstacles at rest that have been visible so far, or will be on the way straight down from (3,).
-
-        The autopilot that lands a vehicle avoids none: what came into sight below it would be seen too late.
-        """
-        return [
-            item.obstacle
-            for item in self._obstacles
-            if not item.obstacle.moves
-            and (item.number in self._seen or item.obstacle.descent_distance_m(pos_ned_m) < item.obstacle.visibility_m)
-        ]
 
     def bodies(
         self,
@@ -302,7 +255,7 @@ class WorldModel:
                 body = replace(body, apart_m=not_driving_away_m(apart_m, math.dist(body.pos_ned_m, pos_ned_m), least_m))
             found.append(body)
         apart_m = budget.barrier_obstacle_m(margin_m)
-        seen = self._visible(pos_ned_m, act_utc_us)
+        seen = self.obstacles.visible(pos_ned_m, act_utc_us)
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in seen.values()]
 
     def exclude(self, agent: int) -> None:

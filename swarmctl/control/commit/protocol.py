@@ -66,7 +66,8 @@ from typing import Protocol
 
 import numpy as np
 
-from swarmctl.control.commit.trajectory_planner import CommitParams, Situation
+from swarmctl.control.commit.commit_params import CommitParams
+from swarmctl.control.commit.situation import Situation
 from swarmctl.core.trajectory import Trajectory, by_exact_clock, delayed, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array

@@ -6,24 +6,23 @@ Each planned trajectory leaves the committed one, keeps clear of everything know
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
-from pydantic import Field
 
 from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOut, KeepOuts, SeparationParams, certify
+from swarmctl.control.commit.commit_params import CommitParams, planning
+from swarmctl.control.commit.situation import Situation, with_run_up
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem, Start
-from swarmctl.control.mpc.swarm_mpc import AxisWeights, MpcParams, SwarmMpc
+from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 from swarmctl.control.reference.approach import approached
 from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
-from swarmctl.core.params import Params
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, positions_at, stopping
-from swarmctl.core.trajectory_message import TrajectoryMessage
-from swarmctl.core.types import Array, Plan, PlanStatus, Reference, Sampled
+from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 
 _BRAKE_POINTS_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # shares of the plan after which braking is tried, latest first
 _MIN_GAIN_M = 0.02  # clearance an evasive trajectory has to gain over the committed one
@@ -31,76 +30,12 @@ _LEAST_COS_TILT = 0.5  # at the start of a plan, as its bounds on tilt allow
 _CLIMB_M_S, _CLIMB_M_S2 = 2.0, 2.0
 _WAY_S, _WAY_M_S, _WAY_M_S2 = 1.0, 0.5, 0.5  # how far ahead on a path around something, and how fast it is gone to
 _WAY_TURNS_RAD = (0.0, 0.3, -0.3, 0.6, -0.6)
-_FOLLOWING_MOVES_Z = 10
-_RUN_UP_M_S2 = 0.8  # acceleration along a path up to its own speed
 _BRAKING_TAIL_S = 2.0  # part of the final braking that is checked against keep-outs
 _OUTWARD_TOLERANCE_M = (
     0.01  # farther out of the flight volume allowed to proposals of a vehicle that is outside already
 )
 _APPROACH_TOLERANCE_M = 0.001  # approach allowed to trajectories that are too close already
 _INTERPOLATION_MARGIN_M = 0.01  # kept by proposals on top: they are checked as straight lines between points
-
-
-class CommitParams(Params):
-    """Sets up planning with `separation.mode = "guaranteed"`."""
-
-    dt_s: float = Field(0.1, ge=0.05, le=0.5)  # time between two points of a trajectory
-    horizon: int = Field(20, ge=5, le=60)  # steps before the final braking
-    moves: int = Field(8, ge=2, le=40)  # control horizon: steps after which the input is constant
-    brake_m_s2: float = Field(1.5, ge=0.5, le=10)  # deceleration of the final braking
-    tilt_fraction_01: float = Field(
-        0.8, gt=0, le=1
-    )  # share of the controller's tilt that plans may use; the rest is for tracking
-    period_s: float = Field(0.1, ge=0, le=2)  # least time between two plans
-    lead_min_s: float = Field(0.06, ge=0.02, le=2)  # least time from proposing to flying; the vehicle may need more
-    lead_max_s: float = Field(1.5, ge=0.1, le=5)  # longest such lead, however late the others answer
-    clock_error_max_s: float = Field(1.0, ge=0.01, le=10)  # nothing is proposed while a peer's clock is known less well
-    right_of_way_rad: float = Field(1.0, ge=0, le=1.2)  # overrides `separation`: plans with stops lock sooner
-    stuck_m: float = Field(1.0, gt=0, le=10)  # overrides `separation`: agents that meet turn while they still move
-    follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # tracks commitments to the centimetre
-
-    def for_vehicle(self, vehicle: VehicleModelParams) -> CommitParams:
-        """Return parameters by which a proposal leaves what is committed no sooner than the vehicle can.
-
-        Until the vehicle responds it flies on as before, and is then beside what it has committed to: six PX4s, which
-        respond after 0.28 s, left tubes of 10 cm 68 to 136 times in a flight with a lead of 0.14 s, and 38 times with
-        0.28 s.
-        """
-        return self.model_copy(update={"lead_min_s": max(self.lead_min_s, vehicle.response_s)})
-
-
-@dataclass(frozen=True, slots=True)
-class DesiredReference:
-    """Describes the motion an agent would follow if it were alone."""
-
-    reference: Sampled
-    follows_path: bool = False  # starts here, clear of obstacles: linearise around it
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Situation:
-    """Collects the inputs of one plan.
-
-    Args:
-        utc_us: now.
-        begin_us: UTC at which the plan begins.
-        desired: motion to approximate.
-        peers: newest message of each peer that takes part, by agent number.
-        others: keep-outs of obstacles and of peers that do not take part, on the planner's grid from `begin_us` on.
-        disturbance_ned_m_s2: (3,) estimated acceleration by wind, which leaves plans less authority.
-    """
-
-    utc_us: int
-    begin_us: int
-    desired: DesiredReference
-    peers: Mapping[int, TrajectoryMessage]
-    others: Sequence[KeepOut]
-    disturbance_ned_m_s2: Array
-
-    @property
-    def followed(self) -> list[Trajectory]:
-        """Return all trajectories that peers may follow from now on."""
-        return [trajectory for message in self.peers.values() for trajectory in message.followed]
 
 
 class TrajectoryPlanner:
@@ -136,10 +71,10 @@ class TrajectoryPlanner:
         right_of_way = separation.model_copy(
             update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
         )
-        planning = _planning(mpc, params)
-        self._hardest_m_s2 = planning.accel_max_m_s2(vehicle)
+        bounded = planning(mpc, params)
+        self._hardest_m_s2 = bounded.accel_max_m_s2(vehicle)
         self._mpc = SwarmMpc(
-            planning,
+            bounded,
             vehicle.model_copy(update={"attitude_rad_s": 0.0}),
             right_of_way,
             agent,
@@ -157,7 +92,7 @@ class TrajectoryPlanner:
         found = self._clear(committed, self._planned(committed, now), now)
         if found is None and now.desired.follows_path:
             speed_m_s = float(np.linalg.norm(committed.sample(np.array([now.begin_us]))[1]))
-            slower = replace(now, desired=_with_run_up(now.desired, speed_m_s))
+            slower = replace(now, desired=with_run_up(now.desired, speed_m_s))
             found = self._clear(committed, self._planned(committed, slower), slower)
         if found is None and now.desired.follows_path:
             checked = (self._checked(committed, way, now) for way in self._ways_along_path(committed, now))
@@ -363,68 +298,6 @@ class TrajectoryPlanner:
         return KeepOuts(found, where)
 
 
-def following(mpc: MpcParams, params: CommitParams) -> MpcParams:
-    """Return controller parameters for tracking commitments: z is stiffer, and freer, than for a desired reference.
-
-    With the three moves of the thesis, heights of a commitment that begins to climb are missed by 0.16 m.
-    """
-    return mpc.model_copy(update={"z": params.follow_z, "control_z": max(mpc.control_z, _FOLLOWING_MOVES_Z)})
-
-
-def slowed(desired: DesiredReference, from_ned_m: Array, pace_01: float) -> DesiredReference:
-    """Return a motion between standing at a place (3,), for a pace of 0, and the desired one, for a pace of 1."""
-
-    def reference(offsets_s: Array) -> tuple[Array, Array]:
-        pos, vel = desired.reference(offsets_s)
-        return from_ned_m + pace_01 * (pos - from_ned_m), pace_01 * vel
-
-    return DesiredReference(reference, desired.follows_path)
-
-
-def _with_run_up(desired: DesiredReference, speed_m_s: float) -> DesiredReference:
-    """Return the same path, entered at the agent's own speed and accelerated along.
-
-    Half-spaces are linearised where the path says the agent will be. On a path that begins faster than the agent moves,
-    they are those of the next corner, and plans cut the present one.
-    """
-    path_m_s = float(np.linalg.norm(desired.reference(np.zeros(1))[1]))
-    if path_m_s <= speed_m_s:
-        return desired
-    rate_1_s = _RUN_UP_M_S2 / path_m_s
-    slow_01 = speed_m_s / path_m_s
-    run_up_s = (1.0 - slow_01) / rate_1_s  # until the path's own speed is reached
-
-    def reference(offsets_s: Array) -> tuple[Array, Array]:
-        spent_s = np.minimum(offsets_s, run_up_s)
-        at_s = (slow_01 + 0.5 * rate_1_s * spent_s) * spent_s + (offsets_s - spent_s)
-        pos, vel = desired.reference(at_s)
-        return pos, vel * (slow_01 + rate_1_s * spent_s)[:, None]
-
-    return DesiredReference(reference, follows_path=True)
-
-
 def _first_steps(keep_out: KeepOut, steps: int) -> KeepOut:
     """Return the keep-out, cut to its first `steps`."""
     return replace(keep_out, pos_ned_m=keep_out.pos_ned_m[: steps + 1])
-
-
-def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
-    """Return controller parameters on the planner's grid, with bounds that leave room for tracking."""
-    return mpc.model_copy(
-        update={
-            "dt_s": params.dt_s,
-            "discretisation": "zoh",
-            "thrust_ahead": "held",
-            "control_z": params.moves,
-            "horizon_z": params.horizon,
-            "control_xy": params.moves,
-            "horizon_xy": params.horizon,
-            "blocking_xy": "none",
-            "u_max": params.tilt_fraction_01 * mpc.u_max,
-            "thrust_min_m_s2": max(mpc.thrust_min_m_s2, 0.7 * GRAVITY_M_S2),
-            "thrust_max_m_s2": min(mpc.thrust_max_m_s2, 1.4 * GRAVITY_M_S2),
-            "terminal_z": "none",
-            "terminal_xy": "none",
-            "proximal_xy": 0.0,  # proposals answer commitments, which stand
-        }
-    )

@@ -18,7 +18,9 @@ from swarmctl.bus.messages.json_messages import encode_message
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, TrajectoryPlanner
+from swarmctl.control.commit.commit_params import CommitParams
+from swarmctl.control.commit.situation import DesiredReference
+from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.clock import SimClock

@@ -11,7 +11,7 @@ from swarmctl.agent.components import SEPARATION_MODES
 from swarmctl.agent.planning.separation_policy import BestEffort, Guaranteed, SeparationInputs, SeparationPolicy
 from swarmctl.bus.local.hub import LocalBus
 from swarmctl.control.collision.separation import KeepOuts, SeparationParams
-from swarmctl.control.commit.trajectory_planner import DesiredReference
+from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.core.types import Phase
 from tests import builders
 from tests.unit.agent.test_coordination import HERE, PLACE, Bench

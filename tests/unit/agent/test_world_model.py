@@ -330,7 +330,7 @@ def test_a_repeated_list_corrects_the_time_of_obstacles_and_they_stay_seen() -> 
     north_m = BALL.center_ned_m[0]
     keep_outs = bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, phase=Phase.TRACK)
     assert [k.pos_ned_m[0][0] for k in keep_outs] == pytest.approx([north_m, north_m - 2.0], abs=0.1)
-    assert bench.world_model.landmarks() == [BALL]
+    assert bench.world_model.obstacles.landmarks() == [BALL]
 
 
 def test_obstacles_that_were_seen_stay_known_when_another_is_added() -> None:
@@ -342,9 +342,9 @@ def test_obstacles_that_were_seen_stay_known_when_another_is_added() -> None:
     more = msgspec.structs.replace(first_list((BALL, far), known.utc_us, 2), next_number=2)
     bench.operator.publish(topics.OBSTACLES, encode_message(more))
     bench.tick()
-    assert bench.world_model.landmarks() == [BALL]
+    assert bench.world_model.obstacles.landmarks() == [BALL]
     bench.set_obstacles(0, 3)
-    assert bench.world_model.landmarks() == []
+    assert bench.world_model.obstacles.landmarks() == []
 
 
 def test_a_landing_knows_obstacles_at_rest_that_were_seen_or_will_be_on_the_way_down() -> None:
@@ -358,7 +358,7 @@ def test_a_landing_knows_obstacles_at_rest_that_were_seen_or_will_be_on_the_way_
     bench.operator.publish(topics.OBSTACLES, encode_message(message))
     bench.tick()
     assert bench.seen == 1
-    assert bench.world_model.obstacles_at_rest(HERE) == [seen, deep]
+    assert bench.world_model.obstacles.at_rest(HERE) == [seen, deep]
 
 
 def test_an_encounter_is_remembered_by_the_obstacles_number_apart_from_peers() -> None:

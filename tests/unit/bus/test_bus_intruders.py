@@ -173,7 +173,7 @@ class Scene:
 
     def knows(self) -> tuple[object, ...]:
         """Return everything that agent 0 believes of others."""
-        obstacles = len(self.world._obstacles)
+        obstacles = len(self.world.obstacles.listed)
         ended = tuple(self.world.has_ended(agent) for agent in (1, 2))
         newest = tuple((m.boot_id, m.seq) for m in self.trajectories.newest.values())
         paths = tuple((path.agent, path.boot_id, path.seq) for path in self.world.paths.latest())

@@ -10,7 +10,8 @@ import pytest
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit import trajectory_planner
 from swarmctl.control.commit.protocol import Commitments
-from swarmctl.control.commit.trajectory_planner import DesiredReference, TrajectoryPlanner
+from swarmctl.control.commit.situation import DesiredReference
+from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.reference.quintic import quintic_to
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
@@ -179,7 +180,7 @@ def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes:
 def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A path at 1 m/s is past the corner before the agent is: rows of the next corner let its plan cut this one."""
     if not runs_up:
-        monkeypatch.setattr(trajectory_planner, "_with_run_up", lambda desired, speed_m_s: desired)
+        monkeypatch.setattr(trajectory_planner, "with_run_up", lambda desired, speed_m_s: desired)
     small = SeparationParams(radius_m=0.3, body_m=0.15)
     agent = committing(0, max_keep_outs=3, separation=small)
     here = np.array([2.716, 2.764, -2.0])

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, TrajectoryPlanner
+from swarmctl.control.commit.commit_params import CommitParams
+from swarmctl.control.commit.situation import DesiredReference
+from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.trajectory import Trajectory, stopping

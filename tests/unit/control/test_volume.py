@@ -7,7 +7,9 @@ import pytest
 
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.collision.volume_certificate import volume_margin_m
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, TrajectoryPlanner
+from swarmctl.control.commit.commit_params import CommitParams
+from swarmctl.control.commit.situation import DesiredReference
+from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.controllers.own import OwnController
