@@ -105,6 +105,8 @@ class Lockstep:
         own: configurations of agents that differ from the run's.
         clocks: errors of the UTC of agents whose clocks are wrong. An agent stamps its messages and records with its
             own; the operator, the simulator and everything on monotonic time are right.
+        rehearses: agents plan on the ground as in the air, as they do in real time. It takes a tenth of a flight's
+            computation and changes nothing, except for agents that the caller makes as slow as their plans would be.
     """
 
     def __init__(
@@ -114,6 +116,8 @@ class Lockstep:
         order: Sequence[int] | None = None,
         own: Mapping[int, Config] | None = None,
         clocks: Mapping[int, ClockError] | None = None,
+        *,
+        rehearses: bool = False,
     ) -> None:
         if reason := why_not_repeatable():
             warnings.warn(f"this flight may differ from the same one elsewhere: {reason}", stacklevel=2)
@@ -135,7 +139,7 @@ class Lockstep:
         self.fault_events: list[dict[str, Any]] = []
         self.world.faults.on_event = self._on_fault
         self._operator = self.hub.connect(topics.OPERATOR, {})
-        self._own = dict(own or {})
+        self._own, self._rehearses = dict(own or {}), rehearses
         self._starts = [0] * agents  # of further processes
         self.agents: list[Agent | None] = [self._agent(i) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
@@ -166,6 +170,7 @@ class Lockstep:
             sink=log,
             on_frame=log.frame,
             stopwatch_ns=time.perf_counter_ns,
+            is_real_time=self._rehearses,
             signing=None if key is None else SigningChannel(key, AGENT_LINK, log.clock.utc_us),
         )
 

@@ -34,6 +34,7 @@ def make_agent(
     sink: TickSink,
     on_frame: Callable[[bytes], None],
     stopwatch_ns: Callable[[], int],
+    is_real_time: bool = True,
     signing: SigningChannel | None = None,
     originals: Mapping[str, int | float] | None = None,
 ) -> Agent:
@@ -43,7 +44,7 @@ def make_agent(
         config: configuration of the run.
         agent: index of this agent, from 0.
         boot_id: differs between restarts of the same agent.
-        transport, bus, clock, sink: see `Ports`.
+        transport, bus, clock, sink, is_real_time: see `Ports`.
         on_frame: called with every MAVLink frame sent or received.
         stopwatch_ns: measures the tick [ns].
         signing: signs and verifies the frames of the link; None: they are plain.
@@ -57,6 +58,7 @@ def make_agent(
         clock=clock,
         sink=sink,
         stopwatch_ns=stopwatch_ns,
+        is_real_time=is_real_time,
     )
     return Agent(_setup_of(config, agent, boot_id, originals or {}), ports)
 

@@ -38,6 +38,7 @@ class Ports:
     clock: Clock  # monotonic time and UTC [us]
     sink: TickSink  # records ticks and events
     stopwatch_ns: Callable[[], int]  # measures the tick and never influences it
+    is_real_time: bool = True  # time passes while the agent computes, so that it may be too slow
 
     def note(self, name: str, **fields: Any) -> None:
         """Record an event of this moment."""

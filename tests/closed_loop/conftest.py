@@ -117,15 +117,16 @@ def fly_now(
     at: dict[float, Callable[[Lockstep], None]] | None = None,
     until: Callable[[Lockstep], bool] | None = None,
     seed: int = 0,
+    rehearses: bool = False,
 ) -> Flight:
     """Fly a configuration to its end, or until `until` returns true.
 
-    `at` maps mission times [s] to actions, each run once; `seed` is that of `nudged`.
+    `at` maps mission times [s] to actions, each run once; `seed` is that of `nudged`; for `rehearses` see `Lockstep`.
     """
     path = ROOT / "configs" / config if config else None
     starts = nudged(np.array(load(path, overrides).starts_ned_m()), seed)
     overrides += (f"start.positions_ned_m={json.dumps(starts.tolist())}",) if seed else ()
-    lockstep = Lockstep(load(path, overrides), order=order)
+    lockstep = Lockstep(load(path, overrides), order=order, rehearses=rehearses)
     due = sorted((at or {}).items())
 
     def on_step(running: Lockstep) -> None:

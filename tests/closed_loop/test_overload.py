@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from swarmctl.agent.planning.rehearsal import Rehearsal
 from swarmctl.control import setpoint
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.swarm_mpc import SwarmMpc
@@ -79,9 +78,8 @@ def test_agents_whose_plans_take_ten_ticks_stay_on_the_ground(
 
     clock.append(0)
     monkeypatch.setattr(SwarmMpc, "plan", slow)
-    if climbs:
-        monkeypatch.setattr(Rehearsal, "plan", lambda *_: None)
-    lockstep = fly_now(*SWAP[:2], f"separation.mode={mode}", config="swap8.toml", until=until).lockstep
+    sets = (*SWAP[:2], f"separation.mode={mode}")
+    lockstep = fly_now(*sets, config="swap8.toml", until=until, rehearses=not climbs).lockstep
     assert (climbed_m(lockstep) > 1.0) == climbs
     if not climbs:
         assert climbed_m(lockstep) < 0.1

@@ -43,7 +43,7 @@ class Planner:
         modes: mode of the newest tick, and the certified plan to linearise around.
         controller: for the mission.
         transit: controller for the ways to the start and to the landing place.
-        rehearsal: plans before the vehicle is flown.
+        rehearsal: plans before the vehicle is flown; None where no agent can be too slow.
         alerts: are told of deadlocks, of the flight volume and of peers that don't answer.
 
     Attributes:
@@ -64,7 +64,7 @@ class Planner:
         modes: ModeSelector,
         controller: Controller,
         transit: Controller,
-        rehearsal: Rehearsal,
+        rehearsal: Rehearsal | None,
         alerts: Alerts,
     ) -> None:
         self._utc_of_us, self._alerts = ports.utc_of_us, alerts
@@ -95,7 +95,7 @@ class Planner:
         reference, now_ref = self._references.reference(state.pos_ned_m)
         self.directive = self._separate(now_us, state, keep_outs, controls)
         plan = self._solve(now_us, start, reference) if flies else None
-        if Phase.STANDBY <= mission.phase < Phase.GOTO_START:
+        if self._rehearsal is not None and Phase.STANDBY <= mission.phase < Phase.GOTO_START:
             self._rehearsal.plan(self._utc_of_us(now_us), start, mission.climb.rest_ned_m(state), keep_outs)
         return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=list(keep_outs))
 
