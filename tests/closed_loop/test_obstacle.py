@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from swarmctl.agent.sensing.world_model import WorldModel
+from swarmctl.agent.sensing.known_obstacles import KnownObstacles
 from swarmctl.bus.messages.json_messages import ListedObstacle
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
@@ -81,7 +81,7 @@ def test_negative_control_unseen_it_is_hit(fly: Fly, monkeypatch: pytest.MonkeyP
         apart_m = np.linalg.norm(running.world.truth_rows()["pos_ned_m"] - center, axis=1)
         return bool(apart_m.min() < running.config.obstacles[0].radius_m)
 
-    monkeypatch.setattr(WorldModel, "_visible", lambda *_: {})
+    monkeypatch.setattr(KnownObstacles, "visible", lambda *_: {})
     blind = fly("sitl.start=air", config=PUBLISHED, until=is_hit)  # after 4.4 s
     assert clearance_m(blind) < 1.0
 
@@ -128,7 +128,7 @@ def summary_past(ball: Obstacle, monkeypatch: pytest.MonkeyPatch) -> dict[str, A
     """Fly past a ball of any sizes, also such as no list of obstacles may have, and return the referee's summary."""
     at = ListedObstacle(number=0, since_utc_us=0, obstacle=ball)
     with monkeypatch.context() as patch:
-        patch.setattr(WorldModel, "_visible", lambda model, pos, utc_us: _seen(at, pos, utc_us))
+        patch.setattr(KnownObstacles, "visible", lambda known, pos, utc_us: _seen(at, pos, utc_us))
         flight = fly_now(*PAST_A_BALL)
     rules = replace(flight.config.rules("lockstep"), obstacles=(JudgedObstacle(number=0, obstacle=ball),))
     return evaluate(flight.lockstep.recorded(), rules, "completed")

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from tests.real.autopilots import PX4
 from tests.real.conftest import Fielder
-from tests.real.test_flights import PX4_CONFIG, flown_in_time
+from tests.real.test_flights import LONE_PX4, PX4_CONFIG, flown_in_time, true_rmse_m
 from tests.real.witness import Truth, Witness
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(1500)]
@@ -88,3 +88,23 @@ def test_six_px4_fly_close_together_by_commitments(field: Fielder) -> None:
 
 def test_six_px4_fly_close_together_without_them(field: Fielder) -> None:
     assert six(field, "best_effort")["tracking"]["index_after_10s_m"] == pytest.approx(SIX_INDEX_M, rel=0.1)
+
+
+FAST = (
+    *("--set", "mission.circle={omega_rad_s=1.5,climb_ned_m_s=0.0}"),
+    *("--set", "mission.duration_s=30"),
+    *("--set", "controller.mpc.blocking_xy=spread"),
+    *("--set", "controller.mpc.control_xy=10"),
+    *("--set", "controller.mpc.du_max=0.1"),
+    *("--set", "controller.mpc.u_max=0.85"),
+    *("--set", "controller.mpc.thrust_max_m_s2=18"),
+)
+
+
+def test_a_lone_px4_tracks_a_circle_of_5_m_at_1_5_rad_s(field: Fielder) -> None:
+    here = field(PX4, 1, FED, feed, is_alone=True)
+    launched = flown_in_time(here, PX4_CONFIG, *LONE_PX4, *CLOSE, *FAST)
+    summary = launched.summary()
+    print(summary["tracking"], true_rmse_m(launched, here.witness.vehicles[0]))
+    assert summary["tracking"]["agents"][0]["steady_rmse_m"] < 0.15
+    assert true_rmse_m(launched, here.witness.vehicles[0]) < 0.3, "the estimate is late"
