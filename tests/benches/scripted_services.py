@@ -91,6 +91,7 @@ class ScriptedServices(Services):
         self.phase = Phase.TRACK
         self.phases: dict[int, Phase] = {}  # of agents whose phase is another one
         self.held = False
+        self.ends_s: float | None = None  # monotonic time at which what all agents fly ends by itself
         self.act: Callable[[], None] = lambda: None
         self.began_s = time.monotonic()
 
@@ -134,13 +135,17 @@ class ScriptedServices(Services):
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:
                 status = status_of(i, self.phases.get(i, self.phase), now_us - self.behind_us, self.held)
-                bus.publish(STATUS, encode_message(msgspec.structs.replace(status, boot_id=self.boot_ids[i])))
+                ends_in_s = status.ends_in_s if self.ends_s is None else self.ends_s - time.monotonic()
+                bus.publish(
+                    STATUS,
+                    encode_message(msgspec.structs.replace(status, boot_id=self.boot_ids[i], ends_in_s=ends_in_s)),
+                )
         if time.monotonic() - self.began_s > 0.3:
             act, self.act = self.act, lambda: None
             act()
 
-    def fly(self) -> LaunchResult:
-        config = load(None, [f"swarm.agents={len(self.agents)}"])
+    def fly(self, *sets: str) -> LaunchResult:
+        config = load(None, [f"swarm.agents={len(self.agents)}", *sets])
         try:
             return FlightSupervisor(config, self, self).fly(lambda: self.interrupts)
         finally:

@@ -90,21 +90,21 @@ def test_six_px4_fly_close_together_without_them(field: Fielder) -> None:
     assert six(field, "best_effort")["tracking"]["index_after_10s_m"] == pytest.approx(SIX_INDEX_M, rel=0.1)
 
 
-FAST = (
-    *("--set", "mission.circle={omega_rad_s=1.5,climb_ned_m_s=0.0}"),
+FAST = (  # 6 m/s, tilted by 44 degrees
+    *("--set", "mission.circle={omega_rad_s=1.2,climb_ned_m_s=0.0}"),
     *("--set", "mission.duration_s=30"),
     *("--set", "controller.mpc.blocking_xy=spread"),
     *("--set", "controller.mpc.control_xy=10"),
     *("--set", "controller.mpc.du_max=0.1"),
     *("--set", "controller.mpc.u_max=0.85"),
     *("--set", "controller.mpc.thrust_max_m_s2=18"),
+    *("--set", "vehicle_model.tilt_max_rad=1.05"),
 )
 
 
-def test_a_lone_px4_tracks_a_circle_of_5_m_at_1_5_rad_s(field: Fielder) -> None:
+def test_a_lone_px4_tracks_a_circle_of_5_m_at_6_m_s(field: Fielder) -> None:
+    """It flies 0.035 m beside it by its estimate, and 0.048 m in truth."""
     here = field(PX4, 1, FED, feed, is_alone=True)
     launched = flown_in_time(here, PX4_CONFIG, *LONE_PX4, *CLOSE, *FAST)
-    summary = launched.summary()
-    print(summary["tracking"], true_rmse_m(launched, here.witness.vehicles[0]))
-    assert summary["tracking"]["agents"][0]["steady_rmse_m"] < 0.15
-    assert true_rmse_m(launched, here.witness.vehicles[0]) < 0.3, "the estimate is late"
+    assert launched.summary()["tracking"]["agents"][0]["steady_rmse_m"] < 0.07
+    assert true_rmse_m(launched, here.witness.vehicles[0]) < 0.1

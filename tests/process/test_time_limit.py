@@ -1,0 +1,28 @@
+"""How long a launch lets a flight last: until the mission, or the way back, should have ended, and some time more."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+import swarmctl.ops.supervision.supervisor
+from swarmctl.core.types import Phase
+from tests.benches.scripted_services import ScriptedServices, ends
+
+pytestmark = pytest.mark.process
+
+
+@pytest.mark.parametrize("phase", [Phase.TRACK, Phase.GOTO_LAND])
+@pytest.mark.parametrize(("ends_in_s", "outcome"), [(8.0, "completed"), (0.5, "failed")])
+def test_a_flight_may_last_as_long_as_its_agents_say_and_no_longer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: Phase, ends_in_s: float, outcome: str
+) -> None:
+    """One that had climbed for an hour needed 330 s for the way back, and was ended as it touched down."""
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_BEYOND_MISSION_S", 1.0)
+    services = ScriptedServices(tmp_path, [ends(0, 4.0)])
+    services.phase, services.ends_s = phase, time.monotonic() + ends_in_s
+    result = services.fly("mission.duration_s=1")
+    assert result.outcome == outcome
+    assert any("did not end within" in problem for problem in result.problems) == (outcome == "failed")
