@@ -16,21 +16,21 @@ class Topic:
     """Describes one stream of an agent, or of the operator, on the bus."""
 
     name: str
-    ring: int  # newest samples kept per sender; several, so that a forged one does not displace the true one
+    ring: int  # newest samples kept per sender; several, so that some broken ones don't displace the true one
     max_bytes: int  # longer messages are delivered as `TOO_LONG`
     reliable: bool
 
 
-PATH = Topic(name="path", ring=4, max_bytes=4096, reliable=False)
-FAR_PATH = Topic(name="far_path", ring=4, max_bytes=4096, reliable=False)  # the paths that peers out of reach hear too
-STATUS = Topic(name="status", ring=4, max_bytes=20_480, reliable=False)
+PATH = Topic(name="path", ring=8, max_bytes=4096, reliable=False)
+FAR_PATH = Topic(name="far_path", ring=8, max_bytes=4096, reliable=False)  # the paths that peers out of reach hear too
+STATUS = Topic(name="status", ring=8, max_bytes=20_480, reliable=False)
 TICK = Topic(name="tick", ring=256, max_bytes=4096, reliable=False)
 COMMAND = Topic(name="command", ring=64, max_bytes=1024, reliable=True)
 ENDED = Topic(name="ended", ring=64, max_bytes=1024, reliable=True)  # of which of its agents a computer says so
 ANSWER = Topic(name="answer", ring=16, max_bytes=4096, reliable=True)
 OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
 MISSION = Topic(name="mission", ring=4, max_bytes=MAX_MISSION_BYTES, reliable=True)
-TRAJECTORY = Topic(name="trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
+TRAJECTORY = Topic(name="trajectory", ring=8, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
 RELAY = Topic(name="relay", ring=4, max_bytes=60_000, reliable=False)  # trajectory messages of others
 TOPICS = (PATH, FAR_PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, MISSION, TRAJECTORY, RELAY)
 FOR_AGENTS = (PATH, FAR_PATH, STATUS, COMMAND, ENDED, OBSTACLES, MISSION, TRAJECTORY, RELAY)

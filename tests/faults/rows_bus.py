@@ -63,9 +63,9 @@ ROWS = (
         protection="checks of what a path holds",
         happens=overhears(malformed),
         reacts=refused("malformed", 20),
-        lasts_s=4.0,
+        lasts_s=6.0,
         told=(r"agent-1 were refused \(path malformed \d+\)",),
-        finally_={"they don't pass": lambda scene: scene.speed_m_s(0) > 0.2},
+        finally_={"they don't arrive": others_arrived},
         off=Off(patches=((peers, "decode_path", lambda payload: unchecked(payload)),)),
     ),
     SimulatedRow(
