@@ -170,7 +170,7 @@ class Lockstep:
             sink=log,
             on_frame=log.frame,
             stopwatch_ns=time.perf_counter_ns,
-            is_real_time=self._rehearses,
+            rehearses=self._rehearses,
             signing=None if key is None else SigningChannel(key, AGENT_LINK, log.clock.utc_us),
         )
 

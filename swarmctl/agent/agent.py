@@ -109,7 +109,7 @@ class Agent:
             modes=self._modes,
             controller=controller,
             transit=transit,
-            rehearsal=make_rehearsal(setup, ports, self._world_model) if ports.is_real_time else None,
+            rehearsal=make_rehearsal(setup, ports, self._world_model) if ports.rehearses else None,
             alerts=alerts,
         )
         self._safety_filter = make_safety_filter(setup, ports, self._world_model)

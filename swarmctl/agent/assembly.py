@@ -34,7 +34,7 @@ def make_agent(
     sink: TickSink,
     on_frame: Callable[[bytes], None],
     stopwatch_ns: Callable[[], int],
-    is_real_time: bool = True,
+    rehearses: bool = True,
     signing: SigningChannel | None = None,
     originals: Mapping[str, int | float] | None = None,
 ) -> Agent:
@@ -44,7 +44,7 @@ def make_agent(
         config: configuration of the run.
         agent: index of this agent, from 0.
         boot_id: differs between restarts of the same agent.
-        transport, bus, clock, sink, is_real_time: see `Ports`.
+        transport, bus, clock, sink, rehearses: see `Ports`.
         on_frame: called with every MAVLink frame sent or received.
         stopwatch_ns: measures the tick [ns].
         signing: signs and verifies the frames of the link; None: they are plain.
@@ -58,7 +58,7 @@ def make_agent(
         clock=clock,
         sink=sink,
         stopwatch_ns=stopwatch_ns,
-        is_real_time=is_real_time,
+        rehearses=rehearses,
     )
     return Agent(_setup_of(config, agent, boot_id, originals or {}), ports)
 

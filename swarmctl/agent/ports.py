@@ -38,7 +38,7 @@ class Ports:
     clock: Clock  # monotonic time and UTC [us]
     sink: TickSink  # records ticks and events
     stopwatch_ns: Callable[[], int]  # measures the tick and never influences it
-    is_real_time: bool = True  # time passes while the agent computes, so that it may be too slow
+    rehearses: bool = True  # plans on the ground as in the air; of use only where time passes while an agent computes
 
     def note(self, name: str, **fields: Any) -> None:
         """Record an event of this moment."""

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
+from sitl.studies.campaign.conditions.scenarios import AGILE
 from tests.real.autopilots import PX4
 from tests.real.conftest import Fielder
 from tests.real.test_flights import LONE_PX4, PX4_CONFIG, flown_in_time, true_rmse_m
@@ -93,11 +94,8 @@ def test_six_px4_fly_close_together_without_them(field: Fielder) -> None:
 FAST = (  # 6 m/s, tilted by 44 degrees
     *("--set", "mission.circle={omega_rad_s=1.2,climb_ned_m_s=0.0}"),
     *("--set", "mission.duration_s=30"),
-    *("--set", "controller.mpc.blocking_xy=spread"),
-    *("--set", "controller.mpc.control_xy=10"),
-    *("--set", "controller.mpc.du_max=0.1"),
+    *(word for setting in AGILE for word in ("--set", setting)),
     *("--set", "controller.mpc.u_max=0.85"),
-    *("--set", "controller.mpc.thrust_max_m_s2=18"),
     *("--set", "vehicle_model.tilt_max_rad=1.05"),
 )
 

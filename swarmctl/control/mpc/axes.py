@@ -55,7 +55,7 @@ class Horizon:
         ones far enough apart to reach the end.
         """
         moves = np.arange(self.control)
-        if not self.spread or self.control >= self.prediction:
+        if not self.spread:
             return moves
         return np.maximum(moves, np.rint(self.prediction * (moves / self.control) ** 2).astype(np.intp))
 

@@ -67,14 +67,15 @@ class Prediction:
         self.axes, self.horizon = axes, horizon
         self.u_min = np.array([a.u_min for a in axes])
         self.u_max = np.array([a.u_max for a in axes])
-        self.du_max = np.array([a.du_max * horizon.blocks() for a in axes])  # (axes, Hc)
+        step, blocks = np.array([a.du_max for a in axes])[:, None], horizon.blocks()
+        self.du_max = step * blocks  # (axes, Hc)
         self.pos_of_accel, self.vel_of_accel = horizon.of_acceleration()  # (Hp, Hp) each
         self._of_accel = np.stack([self.pos_of_accel, self.vel_of_accel])  # (2, Hp, Hp)
         self._of_vel = np.stack(horizon.of_velocity_s())[:, :, None]  # (2, Hp, 1)
         self.hold = horizon.held()  # (Hp, Hc) inputs of a unit increment
         like = np.ones((len(axes), horizon.control + 1))  # operands of one shape are quicker than broadcast ones
         self._least, self._most = (bound[:, None] * like for bound in (self.u_min, self.u_max))
-        ramps = np.array([a.du_max for a in axes])[:, None] * np.append(0.0, horizon.blocks().cumsum())
+        ramps = step * np.append(0.0, blocks.cumsum())
         self._ramps = np.stack([ramps, -ramps])  # (2, axes, Hc+1) from the held input on
         self._has_lag = any(a.lag is not None for a in axes)
         self._lags = [lag_response(a.lag, horizon.dt_s, horizon.prediction) for a in axes]

@@ -340,7 +340,8 @@ def test_numbers_beyond_a_double_are_refused() -> None:
 
 def test_every_topic_has_its_own_name_and_few_old_paths_are_kept() -> None:
     assert len({topic.name for topic in topics.TOPICS}) == len(topics.TOPICS)
-    assert max(topics.PATH.ring, topics.STATUS.ring, topics.OBSTACLES.ring, topics.TRAJECTORY.ring) <= 8
+    assert max(topics.PATH.ring, topics.STATUS.ring, topics.TRAJECTORY.ring) <= 8
+    assert topics.OBSTACLES.ring <= 4
     assert topics.COMMAND.reliable
     assert topics.OBSTACLES.reliable
 
