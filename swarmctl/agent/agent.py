@@ -150,6 +150,11 @@ class Agent:
         return self._ports.bus.sent
 
     @property
+    def heard_bytes(self) -> int:
+        """Number of bytes that the bus has delivered so far."""
+        return self._ports.bus.heard_bytes
+
+    @property
     def refused_frames(self) -> dict[str, int]:
         """Number of the vehicle's MAVLink frames refused so far, by reason."""
         return dict(self._ports.autopilot.refusals.by_reason)
@@ -309,7 +314,8 @@ class Agent:
             unsure_m=jump_m + accuracy_m,
             relays=self._deadlines.level is Level.NONE,
         )
-        self._interest.update(state, self._ports.clock.utc_us())
+        waits = self._mission.phase is not Phase.TRACK
+        self._interest.update(state, self._path_publisher.told_m_s, self._ports.clock.utc_us(), waits=waits)
 
     def _advance(self, now_us: int, state: VehicleState | None) -> None:
         """Advance the mission, and request from the autopilot what its phase needs."""

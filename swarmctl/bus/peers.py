@@ -56,11 +56,14 @@ class PeerPaths:
         max_lead_us: int = MAX_LEAD_US,
         clocks: PeerClocks | None = None,
     ) -> None:
+        peers = tuple(peers)
         self._verifiers = peer_verifiers(peers, PATH, rate_hz, refusals, presence=presence)
         self._max_age_us = max_age_us
         self._max_lead_us = max_lead_us
         self._clocks = clocks
         self._newest: dict[int, PredictedPath] = {}  # in the order of agent numbers
+        self._near_since_us: dict[int, int] = dict.fromkeys(peers, 0)  # those within reach
+        self._near: tuple[PredictedPath, ...] | None = None  # their paths; None: to be made anew
         self.refusals = refusals
         self.heard_utc_us = 0
 
@@ -80,7 +83,7 @@ class PeerPaths:
             ReceivedMessage(path.boot_id, path.seq, path.t0_utc_us, payload), utc_us
         ):
             is_first = path.agent not in self._newest
-            self._newest[path.agent], self.heard_utc_us = path, utc_us
+            self._newest[path.agent], self.heard_utc_us, self._near = path, utc_us, None
             if is_first:
                 self._newest = dict(sorted(self._newest.items()))
 
@@ -99,6 +102,24 @@ class PeerPaths:
     def latest(self) -> tuple[PredictedPath, ...]:
         """Return the newest path of every peer, whatever its age, sorted by agent number."""
         return tuple(self._newest.values())
+
+    def attend(self, within_reach: Iterable[int], utc_us: int) -> None:
+        """Take these peers, and no others, for those within reach."""
+        self._near_since_us = {agent: self._near_since_us.get(agent, utc_us) for agent in within_reach}
+        self._near = None
+
+    def near(self, before_utc_us: int | None = None) -> tuple[PredictedPath, ...]:
+        """Return the newest paths of peers within reach, sorted by agent number; at first that is everybody.
+
+        Args:
+            before_utc_us: leave out those that came within reach after this; None: leave out none.
+        """
+        if self._near is None:
+            since_us = self._near_since_us
+            self._near = tuple([path for agent, path in self._newest.items() if agent in since_us])
+        if before_utc_us is None:
+            return self._near
+        return tuple([path for path in self._near if self._near_since_us[path.agent] <= before_utc_us])
 
     def _refusal(self, sender: str, path: PredictedPath, utc_us: int) -> str:
         if sender != agent_name(path.agent):

@@ -1,4 +1,4 @@
-"""Counts what one participant sends on the bus."""
+"""Counts what one participant sends and hears on the bus."""
 
 from __future__ import annotations
 
@@ -10,16 +10,20 @@ from swarmctl.bus.topics import RELAY, Topic
 
 
 class CountedBus(ForwardingBus):
-    """A bus that counts the messages and bytes it is given to publish.
+    """A bus that counts the messages and bytes it is given to publish, and those it delivers.
 
     Args:
         bus: carries them.
+
+    Attributes:
+        heard_bytes: delivered so far.
     """
 
     def __init__(self, bus: Bus) -> None:
         super().__init__(bus)
         self._messages: Counter[str] = Counter()
         self._bytes: Counter[str] = Counter()
+        self.heard_bytes = 0
 
     @property
     def sent(self) -> dict[str, dict[str, int]]:
@@ -31,6 +35,13 @@ class CountedBus(ForwardingBus):
         self._messages[topic.name] += 1
         self._bytes[topic.name] += len(payload)
         self._bus.publish(topic, payload)
+
+    def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
+        """Return (sender, payload) of the messages since the last call."""
+        arrived = self._bus.receive(topic)
+        for _, payload in arrived:
+            self.heard_bytes += len(payload)
+        return arrived
 
     def relay(self, agents: Iterable[int]) -> int:
         """Pass on messages of other agents."""

@@ -25,7 +25,7 @@ from swarmctl.mavlink.transport import Endpoint, parse_url
 
 _PAIRS_SHOWN = 3
 _HEARTBEATS = 4  # within the time after which a peer counts as silent: three may be missed in succession
-_LEAST_FAR_HZ = 5.0  # a bus on which several are not heard for 0.3 s is lost
+_LEAST_FAR_HZ = 0.5  # two seconds, in which two vehicles may have come ten metres closer
 
 
 def own_controller_problems(
@@ -51,8 +51,8 @@ def path_sharing_problems(sharing: PathSharingParams, separation: SeparationPara
         )
     if 0.0 < sharing.far_hz < _LEAST_FAR_HZ:
         yield (
-            f"agent.path_sharing.far_hz = {sharing.far_hz:g}: allowed: 0, or {_LEAST_FAR_HZ:g} to 25; peers heard less "
-            "often count as silent"
+            f"agent.path_sharing.far_hz = {sharing.far_hz:g}: allowed: 0, or {_LEAST_FAR_HZ:g} to 25; who is heard "
+            "less often comes within reach by silence"
         )
     if sharing.far_hz and separation.mode == "guaranteed":
         yield (

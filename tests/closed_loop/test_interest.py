@@ -16,7 +16,7 @@ from swarmctl.bus.local.hub import LocalBus
 from swarmctl.bus.topics import Topic
 from tests.closed_loop.conftest import Flight, fly_now
 
-FAR = "agent.path_sharing.far_hz=5"
+FAR = "agent.path_sharing.far_hz=1"
 MET_M = 3.0
 TICK_S = 0.02
 
@@ -73,10 +73,10 @@ def oldest_path_s(flight: Flight) -> float:
     return max(ages_s)
 
 
-def head_on() -> Flight:
+def head_on(*more: str) -> Flight:
     """Fly two agents towards each other from out of reach, at 2 m/s."""
     starts = [[0.0, -12.0, -3.0], [0.0, 12.0, -3.0]]
-    return to_goals(starts, starts[::-1], FAR)
+    return to_goals(starts, starts[::-1], FAR, *more)
 
 
 def test_who_comes_from_out_of_reach_is_heard_in_full_before_it_matters() -> None:
@@ -86,6 +86,14 @@ def test_who_comes_from_out_of_reach_is_heard_in_full_before_it_matters() -> Non
     assert not any("unresponsive" in flight.event_names(agent) for agent in range(2))
 
 
-def test_negative_control_who_never_gets_within_reach_is_known_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Interest, "_reaches", lambda *_: False)
-    assert oldest_path_s(head_on()) > 4.0 * TICK_S
+def test_a_peer_that_is_out_of_reach_is_no_concern_of_a_plan() -> None:
+    ticks = head_on().ticks(0)
+    ticks = ticks[np.isfinite(ticks["mission_t_s"])]
+    apart_m = ticks["nearest_peer_m"][1:][(ticks["peers"][:-1] == 0) & (ticks["peers"][1:] == 1)]
+    assert ticks["peers"][0] == 0 and len(apart_m)
+    assert ((apart_m > 10.0) & (apart_m < 20.0)).all(), "13 m at 3 m/s each, 6 m more when the path is a second old"
+
+
+def test_negative_control_who_never_gets_within_reach_is_flown_into(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Interest, "_reaches", lambda *_, **__: False)
+    assert head_on().separation_m() < 0.5

@@ -78,7 +78,7 @@ def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
             "agent.path_sharing={error_m=0.002,heartbeat_s=0.2}",
             ("agent.path_sharing.heartbeat_s = 0.2", "0.125", "separation.lost_after_s", "silent"),
         ),
-        ("agent.path_sharing.far_hz=2", ("agent.path_sharing.far_hz = 2", "5 to 25", "silent")),
+        ("agent.path_sharing.far_hz=0.2", ("agent.path_sharing.far_hz = 0.2", "0.5 to 25", "silence")),
         ("limits.min_separation_m=2.0", ("limits.min_separation_m = 2.0", "separation.radius_m")),
         ("start.spacing_m=0.5", ("agents 0 and 1", "0.50 m apart", "start.spacing_m")),
         ("geofence.corners_ne_m=[[9.0, 9.0], [9.0, -9.0]]", ("geofence.corners_ne_m", "2 corners", "3 or more")),

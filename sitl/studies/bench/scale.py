@@ -1,11 +1,14 @@
 """`bench --scale`: how costs grow with the number of neighbours and of agents, with the fitted exponents and a plot.
 
-Two questions, each with counts of its own:
+Three questions, each with counts of its own:
 
 - neighbours: the tick of one agent that has a row in its problem for each of them, as in `bench`;
 - agents: a whole swarm in lockstep, hovering 3 m apart, where each agent has rows for its two nearest
-  (`separation.max_neighbours`) but hears everybody. Processor time counts all of it, the simulator included; bytes are
-  what an agent gives to its bus. Swarms are measured for at least 2 s, a whole number of periods of their status.
+  (`separation.max_neighbours`) but hears everybody;
+- agents in groups: the same in groups of six that are out of each other's reach (`agent.path_sharing.far_hz`).
+
+Processor time counts all of it, the simulator included; bytes are what an agent gives to its bus, and what it hears.
+Swarms are measured for at least 2 s, a whole number of periods of their status.
 
 An exponent is that of cost = a * count ** exponent, by least squares in logarithms: 0 is flat, 1 is linear.
 """
@@ -16,6 +19,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +40,7 @@ from swarmctl.telemetry.report.pages import render
 _SPACING_M = 3.0
 _HEIGHT_M = 3.0
 _ENDLESS_S = 3600.0
+_GROUP, _GROUPS_APART_M = 6, 40.0  # two rows of three
 _ROWS = 2  # neighbours with rows in a swarm: as many at every count, from 3 agents on
 _SETTLE_STEPS = 50  # after the last agent has begun to track
 _LEAST_S, _STATUS_S = 2.0, 0.2
@@ -46,13 +51,14 @@ _SMALLEST = 2  # count that an exponent begins at: 0 has no logarithm, and 1 age
 class ScaleRow:
     """One line of `scale.json`; what a question does not ask is None."""
 
-    question: str  # "neighbours" or "agents"
+    question: str  # "neighbours", "agents" or "agents in groups"
     solver: str
     count: int
     tick_p50_ms: float  # of one agent
     tick_p99_ms: float
     real_time_per_core: float | None = None  # flown seconds of agents, added up, in one second of a processor
     bytes_per_agent_s: float | None = None  # published on the bus
+    heard_bytes_per_agent_s: float | None = None  # delivered by it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,21 +104,22 @@ def neighbour_rows(counts: Sequence[int], solver: str, ticks: int, on_count: Cal
 def agent_rows(counts: Sequence[int], solver: str, ticks: int, on_count: Callable[[], None]) -> list[ScaleRow]:
     """Measure swarms of so many agents in lockstep, each for at least `ticks` ticks of agents."""
     rows = []
-    for count in counts:
-        rows.append(_swarm_row(count, solver, ticks))
-        on_count()
+    for question, swarm in _SWARMS.items():
+        for count in counts:
+            rows.append(_swarm_row(question, swarm, count, solver, ticks))
+            on_count()
     return rows
 
 
-def _swarm_row(count: int, solver: str, ticks: int) -> ScaleRow:
-    config = _hovering(count, solver)
+def _swarm_row(question: str, swarm: Swarm, count: int, solver: str, ticks: int) -> ScaleRow:
+    config = _hovering(swarm, count, solver)
     flight = Lockstep(config)
     get_under_way(f"{count} agents with {solver}", flight.step, lambda: all(tracks(flight, k) for k in range(count)))
     for _ in range(_SETTLE_STEPS):
         flight.step()
     period = round(_STATUS_S * config.agent.rate_hz)
     steps = period * math.ceil(max(ticks / count, _LEAST_S * config.agent.rate_hz) / period)
-    sent_before, tick_ms = _sent_bytes(flight), list[float]()
+    bytes_before, tick_ms = _bus_bytes(flight), list[float]()
     with settled_garbage():
         began_s = time.process_time()
         for _ in range(steps):
@@ -120,51 +127,88 @@ def _swarm_row(count: int, solver: str, ticks: int) -> ScaleRow:
             tick_ms += [agent.timing.tick_ms for agent in flight.agents if agent is not None]
         spent_s = time.process_time() - began_s
     flown_s, times = steps * count / config.agent.rate_hz, times_of(np.array(tick_ms))
+    sent, heard = (_bus_bytes(flight) - bytes_before) / flown_s
     return ScaleRow(
-        question="agents",
+        question=question,
         solver=solver,
         count=count,
         tick_p50_ms=round(times.p50_ms, 4),
         tick_p99_ms=round(times.p99_ms, 4),
         real_time_per_core=round(flown_s / spent_s, 3),
-        bytes_per_agent_s=round((_sent_bytes(flight) - sent_before) / flown_s, 1),
+        bytes_per_agent_s=round(sent, 1),
+        heard_bytes_per_agent_s=round(heard, 1),
     )
 
 
-def _hovering(count: int, solver: str) -> Config:
-    """Return a square of agents that hover above their starts."""
-    side = math.ceil(math.sqrt(count))
-    places = [[_SPACING_M * (k % side), _SPACING_M * (k // side), -_HEIGHT_M] for k in range(count)]
+def _hovering(swarm: Swarm, count: int, solver: str) -> Config:
+    """Return agents that hover above their starts."""
     return load(
         None,
         [
             f"swarm.agents={count}",
-            f"start.positions_ned_m={places}",
+            f"start.positions_ned_m={swarm.places_ned_m(count)}",
             "mission.kind=hover",
             f"separation.max_neighbours={_ROWS}",
             f"mission.duration_s={_ENDLESS_S}",
             f"controller.mpc.qp.solver='{solver}'",
+            f"agent.path_sharing.far_hz={swarm.far_hz}",
             "sitl.start='air'",
         ],
     )
 
 
-def _sent_bytes(flight: Lockstep) -> int:
-    return sum(topic["bytes"] for agent in flight.agents if agent is not None for topic in agent.sent.values())
+def _square(count: int, spacing_m: float) -> list[list[float]]:
+    """Return places (count, 3), NED [m], in rows of a square."""
+    side = math.ceil(math.sqrt(count))
+    return [[spacing_m * (k % side), spacing_m * (k // side), -_HEIGHT_M] for k in range(count)]
+
+
+def _groups(count: int) -> list[list[float]]:
+    """Return places (count, 3), NED [m], in groups of at most `_GROUP`."""
+    middles, places = _square(math.ceil(count / _GROUP), _GROUPS_APART_M), _square(_GROUP, _SPACING_M)
+    places = [[p + q for p, q in zip(middle, place, strict=True)] for middle in middles for place in places]
+    return places[:count]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Swarm:
+    """A swarm that hovers."""
+
+    places_ned_m: Callable[[int], list[list[float]]]  # of so many agents
+    far_hz: float
+
+
+_SWARMS = {
+    "agents": Swarm(places_ned_m=partial(_square, spacing_m=_SPACING_M), far_hz=0.0),
+    "agents in groups": Swarm(places_ned_m=_groups, far_hz=1.0),
+}
+
+
+SWARMS = len(_SWARMS)  # measured for each count of agents
+
+
+def _bus_bytes(flight: Lockstep) -> Array:
+    """Return the bytes that all agents have published and heard so far (2,)."""
+    agents = [agent for agent in flight.agents if agent is not None]
+    sent = sum(topic["bytes"] for agent in agents for topic in agent.sent.values())
+    return np.array([sent, sum(agent.heard_bytes for agent in agents)], np.float64)
 
 
 def growths(rows: Sequence[ScaleRow]) -> list[Growth]:
     """Return every cost over its count, with its exponent."""
-    near = [row for row in rows if row.question == "neighbours"]
-    swarm = [row for row in rows if row.question == "agents"]
-    spent = {row.count: 1.0 / row.real_time_per_core for row in swarm if row.real_time_per_core}
-    sent = {row.count: row.bytes_per_agent_s for row in swarm if row.bytes_per_agent_s}
-    found = [
-        _growth("tick [ms]", "neighbours", {row.count: row.tick_p50_ms for row in near}),
-        _growth("tick [ms]", "agents", {row.count: row.tick_p50_ms for row in swarm}),
-        _growth("processor time for a second of one agent [s]", "agents", spent),
-        _growth("bytes published by one agent [1/s]", "agents", sent),
-    ]
+    near = {row.count: row.tick_p50_ms for row in rows if row.question == "neighbours"}
+    found = [_growth("tick [ms]", "neighbours", near)]
+    for question in _SWARMS:
+        swarm = [row for row in rows if row.question == question]
+        spent = {row.count: 1.0 / row.real_time_per_core for row in swarm if row.real_time_per_core}
+        sent = {row.count: row.bytes_per_agent_s for row in swarm if row.bytes_per_agent_s}
+        heard = {row.count: row.heard_bytes_per_agent_s for row in swarm if row.heard_bytes_per_agent_s}
+        found += [
+            _growth("tick [ms]", question, {row.count: row.tick_p50_ms for row in swarm}),
+            _growth("processor time for a second of one agent [s]", question, spent),
+            _growth("bytes published by one agent [1/s]", question, sent),
+            _growth("bytes heard by one agent [1/s]", question, heard),
+        ]
     return [growth for growth in found if len(growth.counts)]
 
 
@@ -207,13 +251,15 @@ def _chart(growth: Growth) -> Markup:
 
 def show(rows: Sequence[ScaleRow], console: Console) -> None:
     """Print the rows and what grows how."""
-    table = Table("count", "tick p50 (p99) [ms]", "times real time per core", "bytes per agent [1/s]", box=SIMPLE)
+    columns = "tick p50 (p99) [ms]", "times real time per core", "bytes per agent [1/s]", "bytes heard [1/s]"
+    table = Table("count", *columns, box=SIMPLE)
     for row in rows:
         table.add_row(
             f"{row.count} {row.question}",
             f"{row.tick_p50_ms:.2f} ({row.tick_p99_ms:.2f})",
             "" if row.real_time_per_core is None else f"{row.real_time_per_core:.1f}",
             "" if row.bytes_per_agent_s is None else f"{row.bytes_per_agent_s:.0f}",
+            "" if row.heard_bytes_per_agent_s is None else f"{row.heard_bytes_per_agent_s:.0f}",
         )
     console.print(table)
     for growth in growths(rows):

@@ -55,8 +55,8 @@ class WorldModel:
         rate_hz: tick rate of every agent.
         vouchers: agents of which each sender may say that they have ended.
         note: receives the events `refused` (see `Refusals`), `obstacles_changed` with the list as it was received,
-            `peer_ended` with the process that has, and `unresponsive`: a peer on the bus has published no accepted
-            path for `lost_after_s`; also when that ends, with its duration.
+            `peer_ended` with the process that has, and `unresponsive`: a peer within reach is on the bus and has
+            published no accepted path for `lost_after_s`; also when that ends, with its duration.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class WorldModel:
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
         unresponsive = {
             path.agent: path.t0_utc_us
-            for path in self.paths.latest()
+            for path in self.paths.near(oldest_us)
             if path.t0_utc_us < oldest_us and self._is_there(path.agent) and not self._is_in(path.agent, Phase.DONE)
         }
         if not unresponsive and not self._unresponsive_since_us:
@@ -172,7 +172,7 @@ class WorldModel:
         phase: Phase,
         without: Set[int] = frozenset(),
     ) -> KeepOuts:
-        """Return the keep-outs of peers and visible obstacles over `steps` steps of `dt_us` from `t0_utc_us`.
+        """Return keep-outs of peers within reach and visible obstacles, over `steps` steps of `dt_us` from `t0_utc_us`.
 
         Args:
             pos_ned_m: own position (3,), which decides which obstacles are visible.
@@ -182,7 +182,7 @@ class WorldModel:
             without: peers to leave out, because their committed trajectories are known.
         """
         params, budget, descends = self._params, self._budget, phase is Phase.GOTO_LAND
-        paths = [path for path in self.paths.latest() if path.agent not in without]
+        paths = [path for path in self.paths.near() if path.agent not in without]
         places = aligned(paths, t0_utc_us, dt_us, steps, brake_m_s2=params.brake_m_s2) if paths else None
         found = [
             keep_out_along(
@@ -223,12 +223,12 @@ class WorldModel:
         *,
         committed_peers: Mapping[int, Sequence[Trajectory]],
     ) -> list[Body]:
-        """Return the bodies not to touch `ahead_s` after `act_utc_us`: peers, and obstacles visible from `pos_ned_m`.
+        """Return the bodies not to touch `ahead_s` after `act_utc_us`: peers within reach, and visible obstacles.
 
         A peer that has committed to trajectories is placed on them, however old its message; others on their path.
 
         Args:
-            pos_ned_m: own position (3,).
+            pos_ned_m: own position (3,), which decides which obstacles are visible.
             act_utc_us: UTC at which the setpoint acts.
             ahead_s: time from then to the instant the bodies are valid for.
             margin_m: distance added to the size of every body.
@@ -242,7 +242,7 @@ class WorldModel:
             for pos, vel in (trajectory.at(act_utc_us + ahead_s * 1e6) for trajectory in trajectories):
                 apart_m = committed_apart_m + spread_s * math.hypot(*vel)
                 found.append(Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, responsibility_01=responsibility_01))
-        for path in self.paths.latest():
+        for path in self.paths.near():
             if path.agent in committed_peers:
                 continue
             filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
@@ -332,16 +332,17 @@ class WorldModel:
         }
 
     def has_unresponsive_peer(self, utc_us: int) -> bool:
-        """Return whether some peer is silent and not known to have died: it may be flying on, or our bus is lost.
+        """Return whether some peer within reach is silent and not known to be dead: it may fly on, or our bus is lost.
 
         One may be silent for a while because messages are lost; that several are at once is noticed sooner.
         A peer whose liveliness token has gone while ours is present has died, as far as best effort can know; its path
         has become a keep-out.
         """
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
-        flying = [path for path in self.paths.latest() if not self.has_ended(path.agent)]
+        flying = [p.agent for p in self.paths.near(utc_us - _BUS_LOST_US) if not self.has_ended(p.agent)]
         everybody = len(flying) > 1 and utc_us - self.paths.heard_utc_us > _BUS_LOST_US
-        silent = [path.agent for path in flying if everybody or path.t0_utc_us < oldest_us]
+        late = [p.agent for p in self.paths.near(oldest_us) if p.t0_utc_us < oldest_us]
+        silent = flying if everybody else [agent for agent in late if not self.has_ended(agent)]
         if not silent:
             return False
         alive = self._bus.alive()

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 from swarmctl.agent.ports import Ports
 from swarmctl.agent.setup import AgentSetup
+from swarmctl.agent.sharing.far_paths import FarPaths
 from swarmctl.agent.sharing.path_sharing import PathSharing
 from swarmctl.bus import topics
 from swarmctl.control.controllers.kind import Controller
@@ -43,7 +44,7 @@ class PathPublisher:
         self._max_age_us = round(setup.params.failsafe.state_max_age_s * 1e6)
         self._sharing = PathSharing(setup.params.path_sharing, setup.separation)
         self._gust, self._stop_judge = GustWatch(), StopJudge()
-        self._far_due_us = 0  # when the next path is one that all hear
+        self._far = FarPaths(setup.params.path_sharing)
 
     def publish(
         self,
@@ -69,11 +70,16 @@ class PathPublisher:
             self._gust.update(self._ports.clock.now_us(), disturbance_ned_m_s2)
         if state is None or (flown is None and not (self._is_recent(state) or self._coasts(state))):
             return
-        margin_m = sum((*margins_m, self._gust.margin_m))
-        topic = self._topic()
-        message = self._sharing.message(self._path(state, flown, seq, margin_m), for_all=topic is topics.FAR_PATH)
+        path = self._path(state, flown, seq, sum((*margins_m, self._gust.margin_m)))
+        for_all = self._far.include(path, self._ports.clock.now_us())
+        message = self._sharing.message(path, for_all=for_all)
         if message is not None:
-            self._ports.bus.publish(topic, message)
+            self._ports.bus.publish(topics.FAR_PATH if for_all else topics.PATH, message)
+
+    @property
+    def told_m_s(self) -> float:
+        """Speed that the vehicle keeps to, as those out of reach have been told."""
+        return self._far.told_m_s
 
     def _is_recent(self, state: VehicleState) -> bool:
         """Return whether a state may be continued: peers could not tell that a path from it is older than it says."""
@@ -86,14 +92,6 @@ class PathPublisher:
             return False
         brakes_s = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)) / self._setup.separation.brake_m_s2
         return self._ports.clock.now_us() - state.t_us <= (coasts_s + brakes_s) * 1e6
-
-    def _topic(self) -> topics.Topic:
-        """Return the topic of this tick's path: that of peers within reach, or at times that of all."""
-        far_hz, now_us = self._setup.params.path_sharing.far_hz, self._ports.clock.now_us()
-        if not far_hz or now_us < self._far_due_us:
-            return topics.PATH
-        self._far_due_us = now_us + round(1e6 / far_hz)
-        return topics.FAR_PATH
 
     def _path(self, state: VehicleState, flown: Plan | None, seq: int, margin_m: float) -> PredictedPath:
         if flown is not None:

@@ -19,7 +19,8 @@ class PathSharingParams(Params):
 
     error_m: float = Field(0.0, ge=0, le=0.5)  # by which peers' copy of the path may be off now; 0: share every tick
     heartbeat_s: float = Field(0.1, gt=0, le=0.25)  # peers' copy is never older; they widen distances with its age
-    far_hz: float = Field(0.0, ge=0, le=25)  # rate heard of peers out of reach, 5 or more; 0: all paths are heard
+    far_hz: float = Field(0.0, ge=0, le=25)  # rate heard of peers out of reach, 0.5 or more; 0: all paths are heard
+    speed_m_s: float = Field(3.0, gt=0, le=50)  # that those out of reach count on; faster ones tell them at once
     compact: bool = False  # a third of the bytes, for radio links: points are rounded, by less than a millimetre
 
 

@@ -139,7 +139,7 @@ class TelemetryPublisher:
         here = start.pos_ned_m.tolist()
         peers = [math.dist(here, k.pos_ned_m[0].tolist()) for k in planning.keep_outs if k.priority_id >= 0]
         obstacles = [k.distance_m(start.pos_ned_m) for k in planning.keep_outs if k.priority_id < 0]
-        ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
+        ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.near()]
         return peers, obstacles, max(ages_ms, default=math.nan)
 
     def _status(self, record: TickRecord, mission: MissionState, without: Collection[int]) -> StatusMessage:

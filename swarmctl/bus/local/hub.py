@@ -117,7 +117,7 @@ class LocalHub:
     def detach(self, name: str) -> None:
         """Detach a participant: it sends and receives nothing more; its messages under way still arrive."""
         self._attached.pop(name, None)
-        self.forget_receivers()
+        self._receivers.clear()
         self._views.pop(name, None)
         self._update_views()
 
@@ -159,9 +159,10 @@ class LocalHub:
         if missed and topic.reliable:
             self._held.append(_Held(sender, topic, payload, frozenset(missed)))
 
-    def forget_receivers(self) -> None:
-        """Find out anew who receives what: somebody subscribes to others than before."""
-        self._receivers.clear()
+    def forget_receivers(self, topic: Topic, senders: Collection[str] | None) -> None:
+        """Find out anew who receives a topic of these senders, None: of all; somebody has changed what it hears."""
+        for sender in self._attached if senders is None else senders:
+            self._receivers.pop((sender, topic), None)
 
     def _receivers_of(self, sender: str, topic: Topic) -> list[_Receiver]:
         """Return the subscribers, and where a link draws for each message, all others: what one hears changes no draw.
@@ -216,6 +217,8 @@ class LocalBus(Bus):
         now_us = self._hub.now_us()
         arrived: list[tuple[int, str, bytes]] = []
         for sender, inbox in self._inboxes.get(topic, {}).items():
+            if not inbox or inbox[0].visible_us > now_us:
+                continue
             inboxes.trim(inbox, topic.ring, now_us)
             while inbox and inbox[0].visible_us <= now_us:
                 message = inbox.popleft()
@@ -226,11 +229,11 @@ class LocalBus(Bus):
         return [(sender, payload) for _, sender, payload in arrived]
 
     def hear(self, topic: Topic, senders: Collection[str]) -> None:
-        self._subscriptions[topic] = tuple(senders)
+        before, self._subscriptions[topic] = self._subscriptions.get(topic, ()), tuple(senders)
         inboxes_of_topic = self._inboxes.setdefault(topic, {})
         for sender in inboxes_of_topic.keys() - set(senders):
             del inboxes_of_topic[sender]
-        self._hub.forget_receivers()
+        self._hub.forget_receivers(topic, None if before is None else set(before) ^ set(senders))
 
     def alive(self) -> frozenset[str]:
         return self._hub.alive(self.name) if self._hub.is_attached(self) else frozenset()

@@ -300,12 +300,13 @@ def test_growth_is_measured_written_and_drawn(tmp_path: Path, capsys: pytest.Cap
     assert [(row["question"], row["count"]) for row in rows] == [
         *(("neighbours", count) for count in (1, 2, 4)),
         *(("agents", count) for count in (2, 4)),
+        *(("agents in groups", count) for count in (2, 4)),
     ]
     assert all(0.0 < row["tick_p50_ms"] <= row["tick_p99_ms"] for row in rows)
     assert all(row["real_time_per_core"] > 0.0 and row["bytes_per_agent_s"] > 1000.0 for row in rows[3:])
     said = capsys.readouterr().out
-    assert said.count("exponent") == 4 and "scale.html" in said
-    assert (tmp_path / "scale.html").read_text().count("<figure>") == 4
+    assert said.count("exponent") == 9 and "scale.html" in said
+    assert (tmp_path / "scale.html").read_text().count("<figure>") == 9
 
 
 def test_growth_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
