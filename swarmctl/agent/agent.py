@@ -308,6 +308,7 @@ class Agent:
             self._publisher.seq,
             disturbance_ned_m_s2=self._own_state.estimate.disturbance_ned_m_s2,
             margins_m=(jump_m, accuracy_m, self._deadlines.margin_m, self._planner.directive.margin_m),
+            as_committed=self._planner.directive.as_committed,
         )
         self._separation.publish(
             self._ports.clock.utc_us(),

@@ -21,7 +21,7 @@ from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import Array, Phase
 from tests.benches.guaranteed_trials import GUARANTEED_SWAP, TUBE_M, events, flown
-from tests.closed_loop.conftest import ROOT, mission_is_over
+from tests.closed_loop.conftest import ROOT, fly_now, mission_is_over
 
 
 class HeldUp:
@@ -194,3 +194,24 @@ def test_the_safety_filter_places_peers_on_their_committed_trajectories(
     least_m = SeparationParams().body_m + BarrierParams().margin_m
     assert len(seen_m) > 5
     assert (seen_m == pytest.approx([least_m] * len(seen_m))) is (mode == "guaranteed")
+
+
+def test_who_is_where_it_was_committed_to_be_shares_its_path_once_in_three_ticks() -> None:
+    """Peers only compare it; before it commits to anything, it shares each one."""
+    sets = ("sitl.start=air", "separation.mode=guaranteed")
+    before: dict[str, int] = {}
+
+    def sent(lockstep: Lockstep) -> dict[str, int]:
+        (agent, *_) = lockstep.agents
+        assert agent is not None
+        return {topic: agent.sent[topic]["messages"] for topic in ("path", "trajectory")}
+
+    flight = fly_now(
+        *sets,
+        config="swap8.toml",
+        at={1.0: lambda lockstep: before.update(sent(lockstep))},
+        until=lambda lockstep: lockstep.clock.now_us() > 10e6,
+    )
+    paths, trajectories = (sent(flight.lockstep)[topic] - before[topic] for topic in ("path", "trajectory"))
+    assert trajectories > 100
+    assert paths == pytest.approx(trajectories / 3.0, abs=5)

@@ -173,7 +173,7 @@ def test_timing(line: str, tmp_path: Path) -> None:
     found = {(row["name"], row["solver"], row["neighbours"]) for row in rows}
     assert len(found) == len(rows)
     expected = {(part, solver, count) for part in PARTS for solver in SOLVERS for count in (0, 2)}
-    scenarios = (", guaranteed", ", 1 obstacle")
+    scenarios = (", swap", ", guaranteed", ", 1 obstacle")
     expected |= {(part + scenario, solver, 2) for part in PARTS for solver in SOLVERS for scenario in scenarios}
     assert {key for key in found if "x-y" not in key[0]} == expected
     assert "one tick" in done.stdout

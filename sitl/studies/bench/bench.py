@@ -33,15 +33,14 @@ from sitl.studies.bench.captured import (
     times_of,
 )
 from sitl.studies.bench.output import json_rows, write_texts
-from sitl.studies.bench.ticks import PARTS, measure_commitments, measure_ticks
+from sitl.studies.bench.ticks import PARTS, SWAPS, measure_swaps, measure_ticks
 from swarmctl.control.mpc.solvers.qp import SOLVERS, installed_solvers
 from swarmctl.core.types import Array
 from swarmctl.errors import EXIT_OK
 
 _BESIDE_PILLAR = 2  # neighbours in the scenario with an obstacle
 _OBSTACLE = ", 1 obstacle"
-_GUARANTEED = ", guaranteed"
-_GUARANTEED_NEIGHBOURS = 9  # neighbours in the scenario with commitments
+_SWAP_NEIGHBOURS = 9
 _PART_WIDTH, _CASE_WIDTH = 16, 21  # of columns in the terminal, with the room between them
 _BUSY_LOAD = 0.7  # one-minute load average
 
@@ -86,7 +85,7 @@ def bench(
 ) -> list[BenchRow]:
     """Run all measurements; shows progress on a terminal."""
     rows: list[BenchRow] = []
-    guaranteed = min(_GUARANTEED_NEIGHBOURS, max(1, *neighbours, 0))
+    swapping = min(_SWAP_NEIGHBOURS, max(1, *neighbours, 0))
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("ticks", total=ticks * (len(neighbours) + 2))
 
@@ -96,8 +95,9 @@ def bench(
         for count in neighbours:
             bar.update(task, description=f"{count} neighbours")
             rows += tick_rows(measure_ticks(count, solvers, ticks, on_tick=on_tick), count)
-        bar.update(task, description=f"{guaranteed} neighbours{_GUARANTEED}")
-        rows += tick_rows(measure_commitments(guaranteed, solvers, ticks, on_tick), guaranteed, _GUARANTEED)
+        bar.update(task, description=f"{swapping} neighbours, with and without commitments")
+        for mode, timings in measure_swaps(swapping, solvers, ticks, on_tick).items():
+            rows += tick_rows(timings, swapping, f", {mode}")
         bar.update(task, description=f"{_BESIDE_PILLAR} neighbours, 1 obstacle")
         beside = measure_ticks(_BESIDE_PILLAR, solvers, ticks, pillar=True, on_tick=on_tick)
         rows += tick_rows(beside, _BESIDE_PILLAR, _OBSTACLE)
@@ -129,7 +129,7 @@ def show(rows: Sequence[BenchRow], console: Console) -> None:
     """Print the rows as tables that fit the console, and the ratios."""
     cases = {
         f"{solver}, {count} neighbours{suffix}": _cells(rows, count, solver, suffix)
-        for suffix in ("", _GUARANTEED, _OBSTACLE)
+        for suffix in ("", *(f", {mode}" for mode in SWAPS), _OBSTACLE)
         for count, solver in dict.fromkeys((r.neighbours, r.solver) for r in rows if r.name == "tick" + suffix)
     }
     names, each = list(cases), max(1, (console.width - _PART_WIDTH) // _CASE_WIDTH)

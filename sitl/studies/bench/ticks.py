@@ -1,4 +1,4 @@
-"""Durations of ticks: of one agent among neighbours that are paths on the bus, and of agents that commit.
+"""Durations of ticks: of one agent among neighbours that are paths on the bus, and of agents that swap places.
 
 Solvers take turns tick by tick, so that their ratios are fair on a busy machine. Ticks are timed by the wall clock, as
 in flight.
@@ -24,6 +24,7 @@ from swarmctl.core.types import Array, Phase
 from swarmctl.errors import MissionError
 
 PARTS = ("sense", "setup", "commitment", "spaces", "solve", "certify", "barrier", "send", "tick")
+SWAPS = {"swap": "default", "guaranteed": "guaranteed"}  # what campaigns call them, by name of the row
 _WARM_UP_S = 5.0  # mission time for catching up with the circle
 _READY_WITHIN_TICKS = 1500
 _ENDLESS_S = 3600.0
@@ -58,28 +59,30 @@ def measure_ticks(
     return {solver: np.array(rows) for solver, rows in timings.items()}
 
 
-def measure_commitments(
+def measure_swaps(
     neighbours: int, solvers: Sequence[str], ticks: int, on_tick: Callable[[], None] = lambda: None
-) -> dict[str, Array]:
-    """Measure `neighbours + 1` agents in a swap with guaranteed commitments; (ticks, 9) [ms] over all agents.
+) -> dict[str, dict[str, Array]]:
+    """Measure `neighbours + 1` agents in a swap, in each separation mode; (ticks, 9) [ms] over all agents, by solver.
 
-    The neighbours of `measure_ticks` are paths only and can't commit, so every neighbour is a whole agent here.
+    The neighbours of `measure_ticks` are paths only and can't commit, so every neighbour is a whole agent here, in both
+    modes, which take turns: what commitments cost is the ratio of the two.
     """
-    crowds = {solver: Lockstep(_swap_config(solver, neighbours + 1)) for solver in solvers}
-    timings: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
-    for solver, crowd in crowds.items():
-        get_under_way(f"{neighbours + 1} agents with {solver}", crowd.step, partial(tracks, crowd))
+    modes = [(mode, solver) for mode in SWAPS for solver in solvers]
+    crowds = {each: Lockstep(_swap_config(*each, neighbours + 1)) for each in modes}
+    timings: dict[tuple[str, str], list[tuple[float, ...]]] = {each: [] for each in modes}
+    for (mode, solver), crowd in crowds.items():
+        get_under_way(f"{neighbours + 1} agents with {solver}, {mode}", crowd.step, partial(tracks, crowd))
     with settled_garbage():
         for _ in range(0, ticks, neighbours + 1):
-            for solver, crowd in crowds.items():
+            for each, crowd in crowds.items():
                 crowd.step()
-                timings[solver] += [_parts(agent.timing) for agent in crowd.agents if agent is not None]
+                timings[each] += [_parts(agent.timing) for agent in crowd.agents if agent is not None]
             for _ in range(neighbours + 1):
                 on_tick()
-    return {solver: np.array(rows[:ticks]) for solver, rows in timings.items()}
+    return {mode: {solver: np.array(timings[mode, solver][:ticks]) for solver in solvers} for mode in SWAPS}
 
 
-def _swap_config(solver: str, agents: int) -> Config:
+def _swap_config(mode: str, solver: str, agents: int) -> Config:
     cell = Cell(
         scenario="symmetric",
         agents=agents,
@@ -87,7 +90,7 @@ def _swap_config(solver: str, agents: int) -> Config:
         loss=0.0,
         noise="exact",
         wind_m_s=0.0,
-        protections="guaranteed",
+        protections=SWAPS[mode],
     )
     extra = (f"controller.mpc.qp.solver='{solver}'", f"mission.duration_s={_ENDLESS_S}")
     return config_of(cell, 1, layout_of(cell.scenario, 1, agents), agents, extra=extra)

@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
+from swarmctl.agent.sensing.deviations import Deviations
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
@@ -86,7 +87,7 @@ class Coordination:
         self._grip, self._error_m = Grip.HELD, 0.0
         self._entered_now, self._entered_ahead = Encounters(), Encounters()  # where a plan begins now, or ahead
         self._clock_error_max_us = 1e6 * params.clock_error_max_s
-        self._membership = Membership(agent, peers)
+        self._membership, self._deviations = Membership(agent, peers), Deviations()
         self._ended: frozenset[int] = frozenset()  # peers that take no part any more, by evidence
         self._membership_said: tuple[frozenset[int], ...] = (frozenset(),) * 3
         self._begun_us: int | None = None
@@ -180,7 +181,7 @@ class Coordination:
         if conflicting != self._conflicting:
             self._conflicting = conflicting
             self._note("conflicting_commitment", by=sorted(conflicting))
-        deviating = self._world_model.deviating_peers(known, utc_us, self._tube_m)
+        deviating = self._deviations.deviating(self._world_model.paths.latest(), known, utc_us, self._tube_m)
         deviating |= {agent for agent, message in known.items() if message.tube_m > self._tube_m + _SAME_M}
         committed = {agent for agent, message in known.items() if message.is_committed}
         lost_peers = [agent for agent in known.keys() - required if agent in committed]
@@ -250,6 +251,11 @@ class Coordination:
             lacked_us=peers.lacked_us,
         )
         self._bus.relay(missed)
+
+    @property
+    def is_held(self) -> bool:
+        """Return whether the vehicle is within the tube around what it has committed to."""
+        return self._is_committed and self._grip is Grip.HELD
 
     @property
     def margin_m(self) -> float:

@@ -43,6 +43,7 @@ class SeparationDirective:
     cut_off: str = ""  # why the mission has to end where the vehicle is, because peers don't answer
     alert: str = ""  # what the operator has to know about it
     margin_m: float = 0.0  # peers have to keep this much more, because the vehicle isn't flown as it was committed to
+    as_committed: bool = False  # the vehicle is where it was committed to be, so that peers know without its path
     duration_ns: int = 0  # time spent on agreeing with peers
 
 
@@ -162,6 +163,7 @@ class Guaranteed:
             cut_off=coordination.cut_off,
             alert=coordination.alert,
             margin_m=coordination.margin_m,
+            as_committed=coordination.is_held,
             duration_ns=duration_ns,
         )
 

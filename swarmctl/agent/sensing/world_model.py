@@ -30,12 +30,10 @@ from swarmctl.control.estimation.constant_velocity import CREEP_M_S
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase
 
 _COMPANY_US = 10_000_000  # a peer whose last status is older has left
 _SILENT_US = 2_000_000  # ten statuses; who is heard within it has not ended
-_RECENT_PATH_US = 300_000  # largest age of a path that is compared with commitments
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 _STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
 _DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
@@ -201,18 +199,6 @@ class WorldModel:
         if not seen:
             return KeepOuts(found, places)
         return KeepOuts(found + [keep_out_of_obstacle(o, dt_us, steps, params, number=n) for n, o in seen.items()])
-
-    def deviating_peers(self, messages: Mapping[int, TrajectoryMessage], utc_us: int, allowed_m: float) -> set[int]:
-        """Return peers whose recent path deviates by more than `allowed_m` from all trajectories they committed to."""
-        found = set()
-        for path in self.paths.latest():
-            message, at_us = messages.get(path.agent), path.t0_utc_us
-            if message is None or not message.is_committed or at_us < utc_us - _RECENT_PATH_US:
-                continue
-            here = path.pos_ned_m[0].tolist()
-            if all(math.dist(here, trajectory.at(at_us)[0]) > allowed_m for trajectory in message.followed):
-                found.add(path.agent)
-        return found
 
     def bodies(
         self,

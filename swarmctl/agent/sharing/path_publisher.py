@@ -20,6 +20,10 @@ from swarmctl.control.estimation.gust import GustWatch
 from swarmctl.core.trajectory import grid
 from swarmctl.core.types import MAX_MARGIN_M, Array, FlightMode, Plan, PredictedPath, VehicleState
 
+_COMMITTED_EVERY_US = (
+    60_000  # paths that peers compare with commitments alone, not older than 0.3 s: one in five may come
+)
+
 
 class PathPublisher:
     """Tells peers where the vehicle will be: along its plan, or as somebody else flies it.
@@ -44,6 +48,7 @@ class PathPublisher:
         self._max_age_us = round(setup.params.failsafe.state_max_age_s * 1e6)
         self._sharing = PathSharing(setup.params.path_sharing, setup.separation)
         self._gust, self._stop_judge = GustWatch(), StopJudge()
+        self._published_us, self._margin_m = -_COMMITTED_EVERY_US, 0.0
         self._far = FarPaths(setup.params.path_sharing)
 
     def publish(
@@ -54,6 +59,7 @@ class PathPublisher:
         *,
         disturbance_ned_m_s2: Array,
         margins_m: Iterable[float],
+        as_committed: bool,
     ) -> None:
         """Publish the path of this tick, if peers need it and it is known where the vehicle is.
 
@@ -63,6 +69,7 @@ class PathPublisher:
             seq: number of the tick.
             disturbance_ned_m_s2: (3,) estimate.
             margins_m: what peers have to keep more, for each reason there is besides gusts.
+            as_committed: peers know what is flown from what has been committed to, and compare it with the path.
         """
         if flown is None or not self._widens_in_gusts:
             self._gust.forget()
@@ -70,7 +77,11 @@ class PathPublisher:
             self._gust.update(self._ports.clock.now_us(), disturbance_ned_m_s2)
         if state is None or (flown is None and not (self._is_recent(state) or self._coasts(state))):
             return
-        path = self._path(state, flown, seq, sum((*margins_m, self._gust.margin_m)))
+        margin_m = sum((*margins_m, self._gust.margin_m))
+        if as_committed and flown is not None and margin_m == self._margin_m and not self._is_due():
+            return
+        self._published_us, self._margin_m = self._ports.clock.now_us(), margin_m
+        path = self._path(state, flown, seq, margin_m)
         for_all = self._far.include(path, self._ports.clock.now_us())
         message = self._sharing.message(path, for_all=for_all)
         if message is not None:
@@ -80,6 +91,9 @@ class PathPublisher:
     def told_m_s(self) -> float:
         """Speed that the vehicle keeps to, as those out of reach have been told."""
         return self._far.told_m_s
+
+    def _is_due(self) -> bool:
+        return self._ports.clock.now_us() - self._published_us >= _COMMITTED_EVERY_US
 
     def _is_recent(self, state: VehicleState) -> bool:
         """Return whether a state may be continued: peers could not tell that a path from it is older than it says."""

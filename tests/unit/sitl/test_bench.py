@@ -36,10 +36,16 @@ def captured() -> Captured:
 
 
 @pytest.mark.usefixtures("quick")
+def test_parts_of_a_tick_among_paths_add_up_to_it() -> None:
+    parts = ticks.measure_ticks(2, ["osqp"], 10)["osqp"]
+    assert parts.shape == (10, len(ticks.PARTS))
+    np.testing.assert_allclose(parts[:, :-1].sum(axis=1), parts[:, -1], atol=1e-6)
+
+
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("guaranteed", [False, True])
-def test_parts_of_a_tick_add_up_to_it(guaranteed: bool) -> None:
-    measure = ticks.measure_commitments if guaranteed else ticks.measure_ticks
-    parts = measure(2, ["osqp"], 10)["osqp"]
+def test_parts_of_a_tick_of_a_swap_add_up_to_it(guaranteed: bool) -> None:
+    parts = ticks.measure_swaps(2, ["osqp"], 10)["guaranteed" if guaranteed else "swap"]["osqp"]
     assert parts.shape == (10, len(ticks.PARTS))
     commitment = ticks.PARTS.index("commitment")
     assert (np.delete(parts, commitment, axis=1) > 0.0).all()
