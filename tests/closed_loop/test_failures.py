@@ -51,12 +51,13 @@ def test_negative_control_a_dead_agent_that_is_forgotten_is_closed_in_on(
     remembered = fly(*CLUSTER, at=died, until=has_landed).separation_m(only=0)
     remember = PeerPaths.latest
 
-    def forget(self: PeerPaths) -> tuple[PredictedPath, ...]:
+    def forget(self: PeerPaths, *_: object) -> tuple[PredictedPath, ...]:
         paths = remember(self)
         newest = max((path.t0_utc_us for path in paths), default=0)
         return tuple(path for path in paths if newest - path.t0_utc_us < 200_000)
 
     monkeypatch.setattr(PeerPaths, "latest", forget)
+    monkeypatch.setattr(PeerPaths, "near", forget)
     forgotten = fly(*CLUSTER, at=died, until=closer_than(0.85)).separation_m(only=0)
     assert forgotten < 0.85 <= remembered
 

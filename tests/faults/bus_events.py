@@ -25,13 +25,13 @@ OTHERS = (0, 2, 3)
 _HZ = 25  # ticks of a coarse scene
 
 
-def forget_stale(now: PeerPaths) -> tuple[PredictedPath, ...]:
+def forget_stale(now: PeerPaths, *_: object) -> tuple[PredictedPath, ...]:
     """Return the newest paths without those that are older than 0.2 s, as if who is silent had gone."""
     newest = max((path.t0_utc_us for path in now._newest.values()), default=0)
     return tuple(path for path in now._newest.values() if newest - path.t0_utc_us < 200_000)
 
 
-FORGETS = Off(patches=((PeerPaths, "latest", forget_stale),))
+FORGETS = Off(patches=((PeerPaths, "latest", forget_stale), (PeerPaths, "near", forget_stale)))
 BELIEVES_ALL = Off(patches=((SenderVerifier, "_refusal", lambda *_: ""),))
 NOT_WAITED_FOR = Off(patches=((Coordination, "_required_peers", only_seen),))
 FLIES_ON = Off(patches=((WorldModel, "has_unresponsive_peer", lambda *_: False),))
