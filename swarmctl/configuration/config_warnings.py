@@ -14,6 +14,7 @@ from swarmctl.core.text import point_text
 _BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
 _AGENTS_SHOWN = 3
 _SAME_M = 1e-6  # distances that differ by less are the same but for rounding
+_STEEP_RAD = 0.75  # a real PX4 has yawed at 44 degrees, and had no thrust left at 55
 _ZERO = np.zeros(1)
 
 
@@ -22,7 +23,7 @@ def config_warnings(config: Config) -> list[str]:
     unused = config.mission.unused_sections()
     kind = config.mission.kind
     found = [f"mission.{name} is set, mission.kind is {kind!r}: it is not flown" for name in unused]
-    return [*found, *_begin_elsewhere(config), *_judged_by_more_than_is_kept(config)]
+    return [*found, *_begin_elsewhere(config), *_judged_by_more_than_is_kept(config), *_turned_by_steep_tilt(config)]
 
 
 def warning_lines(config: Config) -> list[str]:
@@ -59,3 +60,11 @@ def _judged_by_more_than_is_kept(config: Config) -> Iterator[str]:
         fails = f"the flight fails below limits.min_separation_m = {limit_m:g}"
         enough_m = math.ceil(100.0 * budget.radius_that_commits_m(limit_m) - 1e-6) / 100.0
         yield f"{keeps}, and {fails}; {enough_m:.2f} m keeps that"
+
+
+def _turned_by_steep_tilt(config: Config) -> Iterator[str]:
+    """Yield that real vehicles may fly as steep as none of them can keep the yaw of Euler angles."""
+    model = config.vehicle_model
+    if config.vehicles and model.heading == "euler" and model.tilt_max_rad > _STEEP_RAD:
+        steep = f"vehicle_model.heading = 'euler' with tilt_max_rad = {model.tilt_max_rad:g}"
+        yield f"{steep}: a tilt that goes round costs real vehicles yaw, then thrust; set it to 'swing_twist'"

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
+from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z, quat_of_tilt
 from swarmctl.core.types import Array, AttitudeSetpoint
 
 VALID_US = 100_000  # a setpoint is stale after this time
@@ -15,6 +15,7 @@ HELD_MAX_US = 200_000  # longest time for which a setpoint is expected to be hel
 _SUNK_M = 0.3  # below the reference; more than a gust costs that thrust makes good again
 _CLIMB_1_S2 = 2.0  # vertical acceleration left for each metre more
 _CLIMB_MAX_M_S2 = 1.0
+_ATTITUDES = {"swing_twist": quat_of_tilt, "euler": quat_from_body_z}  # by `vehicle_model.heading`
 
 
 class SetpointHold:
@@ -86,12 +87,14 @@ def setpoint_of(
 ) -> AttitudeSetpoint:
     """Return the attitude and thrust of virtual controls (3,): u_x, u_y, thrust over mass [m/s2].
 
-    The body down axis is (u_x, u_y, sqrt(1 - u_x^2 - u_y^2)): thesis (3.26) and (3.33) without their singularity. Tilt
-    is limited by `within_tilt`. Thrust is linear in the autopilot's 0..1; `hover_thrust_01` holds the weight.
+    The body down axis is (u_x, u_y, sqrt(1 - u_x^2 - u_y^2)), limited by `within_tilt`. With the yaw of Euler angles
+    these are thesis (3.26) and (3.33) without their singularity. A body that keeps that yaw while its tilt goes round
+    turns about its down axis by fits and starts, faster than autopilots follow: see docs/real_autopilots.md. Thrust is
+    linear in the autopilot's 0..1; `hover_thrust_01` holds the weight.
     """
     ux, uy, specific = within_tilt(virtual_control, params).tolist()
     tilt = math.hypot(ux, uy)
     down = np.array([ux, uy, math.sqrt(max(0.0, 1.0 - tilt * tilt))])
     thrust = hover_thrust_01 * specific / GRAVITY_M_S2
     thrust = min(params.thrust_max_01, max(params.thrust_min_01, thrust)) if math.isfinite(thrust) else math.nan
-    return AttitudeSetpoint(quat_from_body_z(down, yaw_rad), thrust, now_us + VALID_US)
+    return AttitudeSetpoint(_ATTITUDES[params.heading](down, yaw_rad), thrust, now_us + VALID_US)

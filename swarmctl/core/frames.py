@@ -59,6 +59,19 @@ def quat_from_body_z(down_ned: Array, yaw_rad: float) -> Array:
     return quat_from_euler(roll_rad, pitch_rad, yaw_rad)
 
 
+def quat_of_tilt(down_ned: Array, heading_rad: float) -> Array:
+    """Return the quaternion (4,) wxyz of a body that is turned to a heading and then tilted by the shortest rotation.
+
+    That is swing after twist: the tilt itself turns it not about its own down axis `down_ned` (3,), a unit vector that
+    does not point up.
+    """
+    ux, uy, uz = down_ned.tolist()
+    w = math.sqrt(0.5 * (1.0 + uz))
+    x, y = -0.5 * uy / w, 0.5 * ux / w
+    s, c = math.sin(0.5 * heading_rad), math.cos(0.5 * heading_rad)
+    return np.array([w * c, x * c + y * s, y * c - x * s, w * s])
+
+
 def rotate_to_ned(q_nb: Array, vector_frd: Array) -> Array:
     """Rotate a body FRD vector (3,) into NED (3,)."""
     return np.array(numbers_rotated_to_ned(q_nb.tolist(), vector_frd.tolist()))

@@ -37,6 +37,14 @@ def test_commitments_that_keep_less_than_the_flight_is_judged_by_are_named() -> 
     assert lines(guaranteed, "separation.radius_m=0.95") == lines(guaranteed, "limits.min_separation_m=0.8") == []
 
 
+def test_real_vehicles_that_may_tilt_steeply_at_the_yaw_of_euler_angles_are_named() -> None:
+    real = ("swarm.agents=1", "sitl.enabled=false", 'vehicles=[{url="udpin://127.0.0.1:14540",sysid=1}]')
+    steep = "vehicle_model.tilt_max_rad=0.85"
+    (said,) = lines(*real, steep)
+    assert said.startswith("vehicle_model.heading = 'euler' with tilt_max_rad = 0.85") and "'swing_twist'" in said
+    assert lines(steep) == lines(*real) == lines(*real, steep, "vehicle_model.heading=swing_twist") == []
+
+
 @pytest.mark.parametrize("limit_m", [0.52, 0.6, 0.85, 1.5])
 def test_the_radius_named_is_the_least_that_keeps_it(limit_m: float) -> None:
     budget = load(None).separation.budget

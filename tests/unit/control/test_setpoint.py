@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 
 from swarmctl.control.model import Predictor, VehicleModelParams, acceleration, tilt_rate
 from swarmctl.control.setpoint import HELD_MAX_US, VALID_US, SetpointHold, holding_height, setpoint_of, within_tilt
-from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned, euler_from_quat, quat_from_body_z
+from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned, euler_from_quat, quat_from_body_z, quat_of_tilt
 from swarmctl.core.types import Array, VehicleState
 from tests import builders
 
 MODEL = VehicleModelParams()  # thrust 0.05..1, tilt 0.6 rad
+SWUNG = MODEL.model_copy(update={"heading": "swing_twist"})
 G = 9.81
 
 
@@ -48,6 +49,9 @@ def test_attitudes_by_hand(u_x: float, u_y: float, yaw_deg: float, roll_deg: flo
 
 @given(st.floats(-0.39, 0.39), st.floats(-0.39, 0.39), st.floats(-3.1, 3.1))
 def test_the_body_axis_of_the_attitude_is_what_was_asked(u_x: float, u_y: float, yaw: float) -> None:
+    swung = setpoint_of(np.array([u_x, u_y, G]), yaw, 0.5, 0, params=SWUNG).q_nb
+    np.testing.assert_allclose(body_z_ned(swung), [u_x, u_y, math.sqrt(1 - u_x**2 - u_y**2)], atol=1e-9)
+    np.testing.assert_allclose(swung, quat_of_tilt(body_z_ned(swung), yaw), atol=1e-9)
     q_nb = setpoint_of(np.array([u_x, u_y, G]), yaw, 0.5, 0, params=MODEL).q_nb
     np.testing.assert_allclose(body_z_ned(q_nb), [u_x, u_y, math.sqrt(1 - u_x**2 - u_y**2)], atol=1e-9)
     assert math.cos(euler_from_quat(q_nb)[2] - yaw) == pytest.approx(1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from hypothesis import strategies as st
 
 from swarmctl.core.clock import SimClock
 from swarmctl.core.frames import (
+    Array,
     body_z_ned,
     euler_from_quat,
     quat_from_body_z,
     quat_from_euler,
+    quat_of_tilt,
     rotate_to_ned,
 )
 
@@ -104,6 +107,34 @@ def test_attitude_of_a_thrust_direction_has_that_direction_and_that_yaw(u_x: flo
     q_nb = quat_from_body_z(down_ned, yaw)
     np.testing.assert_allclose(body_z_ned(q_nb), down_ned, atol=1e-9)
     assert math.cos(euler_from_quat(q_nb)[2] - yaw) > 1.0 - 1e-9
+
+
+@given(tilt_rad=st.floats(0.0, 1.4), towards_rad=st.floats(-3.1, 3.1), heading_rad=st.floats(-3.1, 3.1))
+def test_a_tilted_body_is_turned_to_its_heading_and_swung_by_the_shortest_way(
+    tilt_rad: float, towards_rad: float, heading_rad: float
+) -> None:
+    flat = math.sin(tilt_rad)
+    down_ned = np.array([flat * math.cos(towards_rad), flat * math.sin(towards_rad), math.cos(tilt_rad)])
+    q_nb = quat_of_tilt(down_ned, heading_rad)
+    np.testing.assert_allclose(body_z_ned(q_nb), down_ned, atol=1e-9)
+    level = quat_from_euler(0.0, 0.0, heading_rad)
+    assert 2.0 * math.acos(min(1.0, abs(float(q_nb @ level)))) == pytest.approx(tilt_rad, abs=1e-6)
+
+
+@pytest.mark.parametrize(("attitude", "rates_rad_s"), [(quat_of_tilt, (-0.5, -0.5)), (quat_from_body_z, (-1.25, 0.0))])
+def test_a_tilt_that_goes_round_turns_the_body_about_its_down_axis(
+    attitude: Callable[[Array, float], Array], rates_rad_s: tuple[float, float]
+) -> None:
+    """At 1.5 rad/s and 48 degrees: evenly, by 1.5 (1 - cos 48); or by fits and starts, twice a round."""
+    step_rad, found = 1e-4, []
+    for towards_rad in np.linspace(0.0, math.tau, 200):
+        (w0, x0, y0, z0), (w1, x1, y1, z1) = (
+            attitude(np.array([math.sin(0.84) * math.cos(at), math.sin(0.84) * math.sin(at), math.cos(0.84)]), 0.0)
+            for at in (towards_rad, towards_rad + step_rad)
+        )
+        turned_rad = 2.0 * (w0 * z1 - x0 * y1 + y0 * x1 - z0 * w1)  # about down, of conj(q0) q1
+        found.append(1.5 * turned_rad / step_rad)
+    assert (min(found), max(found)) == pytest.approx(rates_rad_s, abs=0.01)
 
 
 def test_simulated_clocks_run_together_and_never_back() -> None:

@@ -100,6 +100,7 @@ AGILE = (  # what an x500 needs above 4 m/s, as in configs/x500_fast_circle.toml
     "controller.mpc.control_xy=10",
     "controller.mpc.du_max=0.1",
     "controller.mpc.thrust_max_m_s2=18.0",
+    "vehicle_model.heading=swing_twist",
 )
 _COLUMN_M = 0.3  # radius of a tree
 _POST_RADIUS_M = 0.15
