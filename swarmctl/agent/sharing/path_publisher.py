@@ -20,9 +20,7 @@ from swarmctl.control.estimation.gust import GustWatch
 from swarmctl.core.trajectory import grid
 from swarmctl.core.types import MAX_MARGIN_M, Array, FlightMode, Plan, PredictedPath, VehicleState
 
-_COMMITTED_EVERY_US = (
-    60_000  # paths that peers compare with commitments alone, not older than 0.3 s: one in five may come
-)
+_COMMITTED_EVERY_US = 60_000  # peers compare such paths while they are newer than 0.3 s: one in five suffices
 
 
 class PathPublisher:
