@@ -98,7 +98,7 @@ AHEAD = (
     "mission.duration_s=12",
 )
 COMING = Obstacle(  # seen too late to stop for it as planned
-    center_ned_m=(13.0, 0.0, -5.1), radius_m=0.5, keep_out_m=1.1, visibility_m=4.25, vel_ned_m_s=(-1.0, 0.0, 0.0)
+    center_ned_m=(12.94, 0.0, -5.1), radius_m=0.5, keep_out_m=1.1, visibility_m=4.25, vel_ned_m_s=(-1.0, 0.0, 0.0)
 )
 
 
