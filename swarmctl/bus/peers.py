@@ -121,6 +121,10 @@ class PeerPaths:
             return self._near
         return tuple([path for path in self._near if self._near_since_us[path.agent] <= before_utc_us])
 
+    def late(self, oldest_utc_us: int) -> list[PredictedPath]:
+        """Return the newest paths that are older than this of peers that have been within reach since then."""
+        return [path for path in self.near(oldest_utc_us) if path.t0_utc_us < oldest_utc_us]
+
     def _refusal(self, sender: str, path: PredictedPath, utc_us: int) -> str:
         if sender != agent_name(path.agent):
             return IDENTITY

@@ -13,6 +13,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.agent.sharing.interest import Interest
 from swarmctl.bus import topics
 from swarmctl.bus.local.hub import LocalBus
+from swarmctl.bus.peers import PeerPaths
 from swarmctl.bus.topics import Topic
 from tests.closed_loop.conftest import Flight, fly_now
 
@@ -91,7 +92,31 @@ def test_a_peer_that_is_out_of_reach_is_no_concern_of_a_plan() -> None:
     ticks = ticks[np.isfinite(ticks["mission_t_s"])]
     apart_m = ticks["nearest_peer_m"][1:][(ticks["peers"][:-1] == 0) & (ticks["peers"][1:] == 1)]
     assert ticks["peers"][0] == 0 and len(apart_m)
-    assert ((apart_m > 10.0) & (apart_m < 20.0)).all(), "13 m at 3 m/s each, 6 m more when the path is a second old"
+    freshest_m = (
+        0.9 + 0.1 + 2.0 * 3.0 * (0.8 + 1.0 + 0.5)
+    )  # at 3 m/s each: plan, until the next path, and until it is heard
+    oldest_m = freshest_m + 2.0 * 3.0 * 1.12  # by a path of a second before, looked at a tenth later, in the next tick
+    late_m = 2.0 * 2.0 * 0.14  # flown since it was last looked at
+    assert ((apart_m > freshest_m - late_m) & (apart_m < oldest_m)).all()
+
+
+def silences(flight: Flight) -> int:
+    """Return how often somebody was taken for silent."""
+    return sum(flight.event_names(agent).count("unresponsive") for agent in range(2))
+
+
+SLOW = "bus.delay_ms=100"
+
+
+def test_who_has_just_come_within_reach_is_not_silent_yet() -> None:
+    """What is known of it is up to a second old, and its next path is on its way."""
+    assert silences(head_on(SLOW)) == 0
+
+
+def test_negative_control_by_the_age_of_what_is_known_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    near = PeerPaths.near
+    monkeypatch.setattr(PeerPaths, "near", lambda self, before_utc_us=None: near(self))
+    assert silences(head_on(SLOW)) > 0
 
 
 def test_negative_control_who_never_gets_within_reach_is_flown_into(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -145,8 +145,8 @@ class WorldModel:
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
         unresponsive = {
             path.agent: path.t0_utc_us
-            for path in self.paths.near(oldest_us)
-            if path.t0_utc_us < oldest_us and self._is_there(path.agent) and not self._is_in(path.agent, Phase.DONE)
+            for path in self.paths.late(oldest_us)
+            if self._is_there(path.agent) and not self._is_in(path.agent, Phase.DONE)
         }
         if not unresponsive and not self._unresponsive_since_us:
             return
@@ -327,8 +327,8 @@ class WorldModel:
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
         flying = [p.agent for p in self.paths.near(utc_us - _BUS_LOST_US) if not self.has_ended(p.agent)]
         everybody = len(flying) > 1 and utc_us - self.paths.heard_utc_us > _BUS_LOST_US
-        late = [p.agent for p in self.paths.near(oldest_us) if p.t0_utc_us < oldest_us]
-        silent = flying if everybody else [agent for agent in late if not self.has_ended(agent)]
+        late = [path.agent for path in self.paths.late(oldest_us) if not self.has_ended(path.agent)]
+        silent = flying if everybody else late
         if not silent:
             return False
         alive = self._bus.alive()

@@ -26,7 +26,7 @@ _LOOKING_US = 100_000  # how often it is looked at all
 class Interest:
     """Chooses the peers of which every path and status is heard.
 
-    While the mission is under way, that is: before and after it, statuses are heard of all, who wait for each other.
+    Before and after the mission statuses are heard of all, who wait for each other.
 
     A peer at the distance d, by its newest path, is within reach if
 
@@ -104,8 +104,7 @@ class Interest:
                 within_reach.add(agent)
             else:
                 within_reach.discard(agent)
-        if within_reach != self.within_reach:
-            self._attend(frozenset(within_reach), utc_us)
+        self._attend(frozenset(within_reach), utc_us)
 
     def _attend(self, within_reach: frozenset[int], utc_us: int) -> None:
         if within_reach != self.within_reach:

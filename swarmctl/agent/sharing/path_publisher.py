@@ -75,12 +75,13 @@ class PathPublisher:
             self._gust.update(self._ports.clock.now_us(), disturbance_ned_m_s2)
         if state is None or (flown is None and not (self._is_recent(state) or self._coasts(state))):
             return
-        margin_m = sum((*margins_m, self._gust.margin_m))
-        if as_committed and flown is not None and margin_m == self._margin_m and not self._is_due():
+        margin_m, now_us = sum((*margins_m, self._gust.margin_m)), self._ports.clock.now_us()
+        is_known = as_committed and flown is not None and margin_m == self._margin_m
+        if is_known and now_us - self._published_us < _COMMITTED_EVERY_US:
             return
-        self._published_us, self._margin_m = self._ports.clock.now_us(), margin_m
+        self._published_us, self._margin_m = now_us, margin_m
         path = self._path(state, flown, seq, margin_m)
-        for_all = self._far.include(path, self._ports.clock.now_us())
+        for_all = self._far.include(path, now_us)
         message = self._sharing.message(path, for_all=for_all)
         if message is not None:
             self._ports.bus.publish(topics.FAR_PATH if for_all else topics.PATH, message)
@@ -89,9 +90,6 @@ class PathPublisher:
     def told_m_s(self) -> float:
         """Speed that the vehicle keeps to, as those out of reach have been told."""
         return self._far.told_m_s
-
-    def _is_due(self) -> bool:
-        return self._ports.clock.now_us() - self._published_us >= _COMMITTED_EVERY_US
 
     def _is_recent(self, state: VehicleState) -> bool:
         """Return whether a state may be continued: peers could not tell that a path from it is older than it says."""

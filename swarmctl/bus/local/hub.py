@@ -159,9 +159,9 @@ class LocalHub:
         if missed and topic.reliable:
             self._held.append(_Held(sender, topic, payload, frozenset(missed)))
 
-    def forget_receivers(self, topic: Topic, senders: Collection[str] | None) -> None:
-        """Find out anew who receives a topic of these senders, None: of all; somebody has changed what it hears."""
-        for sender in self._attached if senders is None else senders:
+    def forget_receivers(self, topic: Topic, senders: Collection[str]) -> None:
+        """Find out anew who receives a topic of these senders: somebody has changed what it hears."""
+        for sender in senders:
             self._receivers.pop((sender, topic), None)
 
     def _receivers_of(self, sender: str, topic: Topic) -> list[_Receiver]:
@@ -229,11 +229,12 @@ class LocalBus(Bus):
         return [(sender, payload) for _, sender, payload in arrived]
 
     def hear(self, topic: Topic, senders: Collection[str]) -> None:
-        before, self._subscriptions[topic] = self._subscriptions.get(topic, ()), tuple(senders)
+        self._subscriptions[topic] = tuple(senders)
         inboxes_of_topic = self._inboxes.setdefault(topic, {})
+        changed = inboxes_of_topic.keys() ^ set(senders)  # who has an inbox is heard; the others have sent nothing
         for sender in inboxes_of_topic.keys() - set(senders):
             del inboxes_of_topic[sender]
-        self._hub.forget_receivers(topic, None if before is None else set(before) ^ set(senders))
+        self._hub.forget_receivers(topic, changed)
 
     def alive(self) -> frozenset[str]:
         return self._hub.alive(self.name) if self._hub.is_attached(self) else frozenset()

@@ -249,7 +249,7 @@ COLUMNS = (
         name="nearest_peer_m",
         dtype=_F4,
         unit="m",
-        text="distance to the newest prediction of any peer; inf without peers",
+        text="distance to the newest prediction of any peer within reach; inf without",
         value=lambda tick: tick.nearest_peer_m,
     ),
     Column(
@@ -263,7 +263,7 @@ COLUMNS = (
         name="plan_staleness_ms",
         dtype=_F4,
         unit="ms",
-        text="age of the oldest of the peers' newest paths; NaN without peers",
+        text="age of the oldest of the newest paths of peers within reach; NaN without",
         value=lambda tick: tick.plan_staleness_ms,
         formerly="path_age_ms",
         view=_STALENESS,
