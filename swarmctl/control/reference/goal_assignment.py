@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 
+from swarmctl.control.reference.least_assignment import least_assignment
 from swarmctl.core.types import Array
 
 ROOM = 1.05  # places are this much farther apart than agents keep, so that no agent pushes once all have arrived
@@ -94,15 +95,13 @@ def _assigned(starts: Array, places: Array) -> Array:
     The sum of squares is the least of any permutation, so paths flown in the same time cross as little as possible.
     Squares are whole multiples of _TINY_M2: rounding of the last digit decides no tie.
     """
-    from scipy.optimize import linear_sum_assignment  # imports for a second, needed only where agents share a goal
-
     best, least = places, math.inf
     for rotation in range(_ROTATIONS):
         angle = 2.0 * math.pi * rotation / _ROTATIONS
         c, s = math.cos(angle), math.sin(angle)
         rotated = places @ np.array([[c, s], [-s, c]])
         squares = ((starts[:, None] - rotated) ** 2).sum(axis=2)  # (N, N) of every agent to every place [m2]
-        assigned = rotated[linear_sum_assignment(np.rint(squares / _TINY_M2))[1]]
+        assigned = rotated[least_assignment(np.rint(squares / _TINY_M2))]
         total = float(((assigned - starts) ** 2).sum())
         if total < least - _TINY_M2:
             best, least = assigned, total
