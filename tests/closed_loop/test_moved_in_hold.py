@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from sitl.lockstep import Lockstep
 from swarmctl.control.estimation.constant_velocity import StopJudge
+from swarmctl.core.types import Phase
 from swarmctl.mavlink.codec import Codec
 from tests.closed_loop.conftest import COARSE, Fly, closer_than
 
@@ -50,9 +51,14 @@ def move(running: Lockstep) -> None:
     say(running, mavlink.MAVLink_command_int_message(MOVED + 1, 1, frame, command, 0, 0, *params))
 
 
+def others_are_done(running: Lockstep) -> bool:
+    """Return whether no other is in the mission any more: who was moved stays in hold, and nobody lands it."""
+    return all(len(log.rows) and log.rows[-1]["phase"][0] > Phase.TRACK for log in running.logs[:MOVED])
+
+
 @pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
 def test_others_keep_away_from_who_is_moved_in_hold(fly: Fly, mode: str) -> None:
-    flight = fly(*SCENE, f"separation.mode={mode}", at={TAKEN_S: take, MOVED_S: move})
+    flight = fly(*SCENE, f"separation.mode={mode}", at={TAKEN_S: take, MOVED_S: move}, until=others_are_done)
     assert flight.separation_m() >= 0.85
     way_m = flight.pos_ned_m[:, MOVED, 0]
     assert way_m.min() < -4.0, "it has passed them"
