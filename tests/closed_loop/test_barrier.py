@@ -11,7 +11,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from swarmctl.control.collision import barrier
 from swarmctl.core.obstacle import Obstacle
-from tests.closed_loop.conftest import COARSE, ROOT, Flight, Fly, mission_is_over
+from tests.closed_loop.conftest import AT_100_HZ, COARSE, FINE, ROOT, Flight, Fly, mission_is_over
 
 NO_ROWS = ("mission.kind=swap", "sitl.start=air", "controller.kind=mpc", "mission.duration_s=7")
 OFF = "agent.barrier.enabled=false"
@@ -24,6 +24,7 @@ def ring(count: int) -> tuple[str, ...]:
     angles = [2.0 * math.pi * i / count for i in range(count)]
     places = [[round(RADIUS_M * math.cos(a), 3), round(RADIUS_M * math.sin(a), 3), -3.0] for a in angles]
     return (
+        AT_100_HZ,
         f"swarm.agents={count}",
         f"start.positions_ned_m={places}",
         f"mission.swap.travel_s={TRAVEL_S}",
@@ -64,14 +65,14 @@ def test_negative_control_without_it_they_touch(count: int) -> None:
 
 
 def test_with_the_dead_time_and_lag_of_a_real_autopilot_they_do_not_touch() -> None:
-    flight = through_each_other(*ring(2), "sitl.estimator=exact", config="x500_circle.toml")
+    flight = through_each_other(*ring(2), FINE, "sitl.estimator=exact", config="x500_circle.toml")
     assert flight.separation_m() >= X500_BODY_M
     assert min(safety_filter_ticks(flight)) > 10
 
 
 def test_negative_control_of_a_lag_that_it_is_not_told_of_they_touch() -> None:
     plain = ("vehicle_model.attitude_rad_s=0", "vehicle_model.delay_s=0", "vehicle_model.drag_1_s=0")
-    flight = through_each_other(*ring(2), "sitl.estimator=exact", *plain, config="x500_circle.toml")
+    flight = through_each_other(*ring(2), FINE, "sitl.estimator=exact", *plain, config="x500_circle.toml")
     assert flight.separation_m() < X500_BODY_M
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from swarmctl.control.mpc import swarm_mpc
 from swarmctl.core.types import Landed, Mode, Phase, PlanStatus
-from tests.closed_loop.conftest import Flight, Fly, closer_than, mission_is_over, mission_t_s
+from tests.closed_loop.conftest import FINE, Flight, Fly, closer_than, mission_is_over, mission_t_s
 
-ALONE = ("sitl.start=air", "swarm.agents=1", "mission.duration_s=15")
+ALONE = (FINE, "sitl.start=air", "swarm.agents=1", "mission.duration_s=15")
 
 
 def test_whole_mission_is_flown_and_landed(circle: Flight) -> None:
@@ -33,7 +33,7 @@ def test_summed_mean_tracking_error(circle: Flight) -> None:
 
 def test_without_more_room_for_who_comes_closer_the_error_is_within_3_percent_of_its_lower_bound(fly: Fly) -> None:
     """Agents in a formation swing by centimetres, for which `separation.approach_01` keeps room: 2 to 3 %."""
-    flight = fly("separation.approach_01=0", "sitl.start=air", until=mission_is_over)
+    flight = fly(FINE, "separation.approach_01=0", "sitl.start=air", until=mission_is_over)
     assert flight.summed_mean_error_m(after_s=10.0) <= 1.03 * np.sqrt(3) * 0.9
 
 
@@ -67,7 +67,7 @@ def test_negative_control_agents_that_ignore_each_other_collide(fly: Fly) -> Non
 
 def test_compact_paths_shared_by_event_cost_a_tenth_of_the_traffic_and_no_separation(circle: Flight, fly: Fly) -> None:
     sparing = "agent.path_sharing={error_m=0.002,compact=true}"
-    by_event = fly(sparing, "sitl.start=air", "mission.duration_s=8", until=mission_is_over)
+    by_event = fly(FINE, sparing, "sitl.start=air", "mission.duration_s=8", until=mission_is_over)
     for agent, flown in zip(range(3), by_event.lockstep.agents, strict=True):
         assert flown is not None
         sent = flown.sent["path"]
@@ -98,7 +98,7 @@ def test_negative_control_without_the_observer_a_wrong_mass_does(fly: Fly) -> No
 def test_thrust_stays_calm_with_half_a_tick_of_latency_but_not_under_the_equality(
     fly: Fly, terminal: str, calm: bool
 ) -> None:
-    late = ("sitl.link_latency_ms=10", f"controller.mpc.terminal_z={terminal}", "swarm.agents=1")
+    late = (FINE, "sitl.link_latency_ms=10", f"controller.mpc.terminal_z={terminal}", "swarm.agents=1")
     flight = fly("sitl.start=air", "mission.duration_s=12", *late, until=mission_is_over)
     ticks = flight.ticks(0)
     spread_01 = float(ticks["setpoint_thrust_01"][ticks["mission_t_s"] > 8.0].std())
@@ -113,7 +113,8 @@ def test_without_peers_the_reference_is_met(fly: Fly) -> None:
 
 def closing_in(fly: Fly, *sets: str) -> Flight:
     """Fly twelve agents from their starts to the circle."""
-    return fly("swarm.agents=12", "sitl.start=air", *sets, until=lambda lockstep: mission_t_s(lockstep) >= 1.5, seed=1)
+    sets = (FINE, "swarm.agents=12", "sitl.start=air", *sets)
+    return fly(*sets, until=lambda lockstep: mission_t_s(lockstep) >= 1.5, seed=1)
 
 
 def test_twelve_agents_that_close_in_on_one_point_keep_their_distance(fly: Fly) -> None:

@@ -16,11 +16,10 @@ from swarmctl.config import load
 from swarmctl.control.reference.kinds import goto
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array
-from tests.closed_loop.conftest import nudged
+from tests.closed_loop.conftest import AT_100_HZ, nudged
 
 SMALL = (  # bodies of 15 cm that keep 30 cm
     "sitl.preset=crazyflie",
-    "sitl.physics_hz=100",
     "vehicle_model={delay_s=0.04,attitude_rad_s=20.0,drag_1_s=0.25,hover_thrust_01=0.43}",
     "separation={radius_m=0.3,body_m=0.15}",
     "limits.min_separation_m=0.15",
@@ -37,6 +36,7 @@ class Flown:
         config = load(
             None,
             [
+                AT_100_HZ,
                 "sitl.start=air",
                 f"swarm.agents={len(starts)}",
                 f"start.positions_ned_m={json.dumps(starts.tolist())}",
@@ -126,7 +126,7 @@ UNDAMPED = "controller.mpc.proximal_xy=0"
 
 
 def ten_to_one_point(*sets: str) -> Flown:
-    flown = Flown(layout_of("same_goal", 8, 10).starts_ned_m, np.zeros((1, 3)), 6.5, "sitl.physics_hz=100", *sets)
+    flown = Flown(layout_of("same_goal", 8, 10).starts_ned_m, np.zeros((1, 3)), 6.5, *sets)
     assert flown.separation_m > 0.85
     return flown
 

@@ -12,7 +12,7 @@ from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.mavlink.vehicle.autopilot import Autopilot
 from swarmctl.simulator_config import FaultParams
-from tests.closed_loop.conftest import Flight, Fly
+from tests.closed_loop.conftest import Flight, Fly, mission_t_s
 
 ALONE = ("swarm.agents=1", "sitl.start=air", "mission.duration_s=8")
 AT_S = 4.03
@@ -88,10 +88,7 @@ def times_abandoned(fly: Fly) -> int:
         gap = FaultParams(kind="link_loss", vehicle=0, value=1.0, for_s=0.35, direction="from_vehicle")
         running.world.faults.begin(gap, running.world.since_boot_us)
 
-    def over(running: Lockstep) -> bool:
-        return running.clock.now_us() > 10_500_000
-
-    flight = fly(*GUARANTEED, at={2.0: stop, 4.0: stop}, until=over)
+    flight = fly(*GUARANTEED, at={2.0: stop, 4.0: stop}, until=lambda running: mission_t_s(running) > 4.1)
     assert Mode.STATE_STALE in flight.modes(0)
     return flight.event_names(0).count("commitments")
 

@@ -17,7 +17,7 @@ from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.config import load
 from swarmctl.core.clock import ClockError
 from tests.benches.guaranteed_trials import COMMITTED_M, GUARANTEED_SWAP, TOUCH_M, events, flown
-from tests.closed_loop.conftest import mission_t_s
+from tests.closed_loop.conftest import AT_100_HZ, mission_t_s
 
 
 def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
@@ -65,6 +65,7 @@ def behind_one_that_dies() -> tuple[float, float]:
         load(
             None,
             (
+                AT_100_HZ,
                 "swarm.agents=2",
                 "start.positions_ned_m=[[-12,0,-5],[-6,0,-5]]",
                 "mission.kind=goto",

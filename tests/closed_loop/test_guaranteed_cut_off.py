@@ -22,6 +22,7 @@ from swarmctl.bus.bus import agent_name
 from swarmctl.config import load
 from swarmctl.core.types import Phase
 from tests.benches.guaranteed_trials import COMMITTED_M, GUARANTEED_SWAP, TOUCH_M, events, flown, fly_until
+from tests.closed_loop.conftest import COARSE
 
 
 def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
@@ -172,7 +173,7 @@ def test_all_arrive_although_links_fail_for_seconds(relayed: bool, monkeypatch: 
 
 def cut_off_on_the_ground() -> tuple[bool, list[dict[str, Any]]]:
     """Return whether four agents take off that do not hear the last of them for 7 s before, and who is excluded."""
-    sets = ("swarm.agents=4", "separation.mode=guaranteed", "mission.kind=swap", "agent.rate_hz=25")
+    sets = (*COARSE, "swarm.agents=4", "separation.mode=guaranteed", "mission.kind=swap")
     lockstep = Lockstep(load(None, sets))
     alone, others = agent_name(3), frozenset(map(agent_name, range(3)))
 

@@ -21,7 +21,7 @@ from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import Array, Phase
 from tests.benches.guaranteed_trials import GUARANTEED_SWAP, TUBE_M, events, flown
-from tests.closed_loop.conftest import ROOT, fly_now, mission_is_over
+from tests.closed_loop.conftest import ROOT, fly_now, mission_is_over, mission_t_s
 
 
 class HeldUp:
@@ -210,7 +210,7 @@ def test_who_is_where_it_was_committed_to_be_shares_its_path_once_in_three_ticks
         *sets,
         config="swap8.toml",
         at={1.0: lambda lockstep: before.update(sent(lockstep))},
-        until=lambda lockstep: lockstep.clock.now_us() > 10e6,
+        until=lambda lockstep: mission_t_s(lockstep) > 3.6,
     )
     paths, trajectories = (sent(flight.lockstep)[topic] - before[topic] for topic in ("path", "trajectory"))
     assert trajectories > 100

@@ -24,7 +24,7 @@ from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import PipeTransport
 from swarmctl.mavlink.vehicle import mode_watch, state_samples
-from tests.closed_loop.conftest import Fly, closer_than, mission_t_s
+from tests.closed_loop.conftest import AT_100_HZ, FINE, Fly, closer_than, mission_t_s
 
 SETPOINT = 82  # SET_ATTITUDE_TARGET
 SLEEP_S = 1.62  # the first tick afterwards receives a state but no mode
@@ -65,7 +65,7 @@ def test_negative_control_an_autopilot_that_lands_at_speed_among_others_comes_to
 
 # -- PX4 returns to OFFBOARD by itself when setpoints resume ----------------------------------------------------------
 
-ALONE = ("swarm.agents=1", "mission.duration_s=8")
+ALONE = (AT_100_HZ, "swarm.agents=1", "mission.duration_s=8")
 
 
 class Watched:
@@ -264,7 +264,7 @@ def test_an_arducopter_whose_thrust_would_be_a_climb_rate_is_not_armed() -> None
 # -- a vehicle that stands at another heading than the mission's ------------------------------------------------------
 
 
-X500 = ("sitl.preset=x500", "vehicle_model={attitude_rad_s=9.5,drag_1_s=0.3,hover_thrust_01=0.49}")
+X500 = (FINE, "sitl.preset=x500", "vehicle_model={attitude_rad_s=9.5,drag_1_s=0.3,hover_thrust_01=0.49}")
 
 
 def turned_rad_s() -> float:

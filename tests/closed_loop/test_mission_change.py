@@ -15,9 +15,16 @@ from swarmctl.core.operator_verbs import BEGIN, MISSION
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.orders.mission_file import mission_message
+from tests.closed_loop.conftest import AT_100_HZ
 from tests.closed_loop.test_operator import fly_for, fly_until, outcome, phase
 
-HOVER = ("swarm.agents=2", "start.positions_ned_m=[[0,0,-3],[4,0,-3]]", "mission.kind=hover", "sitl.start=air")
+HOVER = (
+    AT_100_HZ,
+    "swarm.agents=2",
+    "start.positions_ned_m=[[0,0,-3],[4,0,-3]]",
+    "mission.kind=hover",
+    "sitl.start=air",
+)
 SWAP = """
 [mission]
 kind = "waypoints"
@@ -156,7 +163,13 @@ def test_a_mission_below_the_ground_is_refused_where_only_the_vehicle_knows_the_
         f'[mission]\nkind = "waypoints"\nduration_s = 9.0\nwaypoints.speed_m_s = 1.5\n'
         f"waypoints.lists = [{{ points_ned_m = {points} }}]\n"
     )
-    alone = ("swarm.agents=1", "start.positions_ned_m=[[0,0,-3]]", "mission.kind=hover", "mission.duration_s=60")
+    alone = (
+        AT_100_HZ,
+        "swarm.agents=1",
+        "start.positions_ned_m=[[0,0,-3]]",
+        "mission.kind=hover",
+        "mission.duration_s=60",
+    )
     real = load(None, (*alone, "sitl.enabled=false", 'vehicles=[{sysid=1, url="udpin://0.0.0.0:14540"}]'))
     flight = Lockstep(load(None, alone))
     fly_until(flight, lambda: phase(flight, 0) is Phase.TRACK)
@@ -169,7 +182,7 @@ def test_a_mission_below_the_ground_is_refused_where_only_the_vehicle_knows_the_
 def test_a_mission_on_whose_way_the_fence_is_left_is_refused(tmp_path: Path) -> None:
     """The fence has two arms; the mission is in the other one."""
     fence = "geofence.corners_ne_m=[[-3,-3],[20,-3],[20,3],[3,3],[3,20],[-3,20]]"
-    place = ("swarm.agents=1", "start.positions_ned_m=[[12,0,-3]]", "mission.kind=hover", "sitl.start=air")
+    place = (AT_100_HZ, "swarm.agents=1", "start.positions_ned_m=[[12,0,-3]]", "mission.kind=hover", "sitl.start=air")
     flight = Lockstep(load(None, (*place, "mission.duration_s=60", fence)))
     fly_until(flight, lambda: phase(flight, 0) is Phase.TRACK)
     for goal, reasons in (("[12.0, 2.0, -3.0]", []), ("[0.0, 14.0, -3.0]", ["on the way is outside of the geofence"])):

@@ -17,7 +17,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, Mode, Phase
 from swarmctl.errors import ConfigError
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, evaluate
-from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
+from tests.closed_loop.conftest import AT_100_HZ, FINE, Flight, Fly, fly_now, mission_is_over
 
 CONFIG, PUBLISHED = "improved_6_obstacle.toml", "thesis_6_obstacle.toml"
 
@@ -25,7 +25,7 @@ CONFIG, PUBLISHED = "improved_6_obstacle.toml", "thesis_6_obstacle.toml"
 @cache
 def with_published_weights() -> Flight:
     """Fly from the ground and back, past the obstacle twice."""
-    return fly_now(config=PUBLISHED)
+    return fly_now(FINE, config=PUBLISHED)
 
 
 def clearance_m(flight: Flight) -> float:
@@ -36,7 +36,7 @@ def clearance_m(flight: Flight) -> float:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_all_keep_clear_of_the_obstacle_and_of_each_other(fly: Fly, seed: int) -> None:
     """The worst of starts 1 to 3, shifted by a millimetre, are 1.763 m and 0.908 m."""
-    past = fly("sitl.start=air", config=CONFIG, until=mission_is_over, seed=seed)
+    past = fly(FINE, "sitl.start=air", config=CONFIG, until=mission_is_over, seed=seed)
     assert clearance_m(past) >= 1.75
     assert past.separation_m() >= 0.89
     for agent in range(3):
@@ -62,7 +62,7 @@ def test_with_published_weights_all_stay_off_the_obstacle_and_land() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_with_published_weights_all_stay_off_the_obstacle_from_starts_a_millimetre_off(fly: Fly, seed: int) -> None:
-    check_published_weights(fly("sitl.start=air", config=PUBLISHED, until=mission_is_over, seed=seed))
+    check_published_weights(fly(FINE, "sitl.start=air", config=PUBLISHED, until=mission_is_over, seed=seed))
 
 
 def test_the_obstacle_is_known_only_within_the_visibility_distance() -> None:
@@ -90,7 +90,7 @@ def test_negative_control_unseen_it_is_hit(fly: Fly, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("speed_m_s", [0.5, 1.0])
 def test_a_column_that_comes_straight_at_a_hovering_agent_is_passed(speed_m_s: float, mode: str) -> None:
     """Fled from straight back, at 1 m/s it came to 0.53 m of who commits to come to rest."""
-    hover = ("mission.kind=hover", "mission.duration_s=30", "sitl.start=air", f"separation.mode={mode}")
+    hover = (AT_100_HZ, "mission.kind=hover", "mission.duration_s=30", "sitl.start=air", f"separation.mode={mode}")
     flight = Lockstep(load(None, ("swarm.agents=2", "start.positions_ned_m=[[0,0,-5],[0,9,-5]]", *hover)))
     while {log.rows[-1]["phase"][0] if log.rows else 0 for log in flight.logs} != {Phase.TRACK}:
         flight.step()

@@ -10,9 +10,9 @@ import pytest
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from swarmctl.core.types import ControlMode, Phase
-from tests.closed_loop.conftest import ROOT
+from tests.closed_loop.conftest import AT_100_HZ, COARSE, ROOT
 
-ON_GROUND_ALONE = ("swarm.agents=1", "mission.duration_s=1")
+ON_GROUND_ALONE = (*COARSE, "swarm.agents=1", "mission.duration_s=1")
 
 
 def fly_until(flight: Lockstep, reached: Callable[[], bool], seconds: float = 60.0) -> None:
@@ -76,7 +76,7 @@ def test_the_fence_of_the_configuration_is_that_of_goto() -> None:
 @pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
 def test_an_agent_goes_to_a_point_through_the_others_and_resume_continues_the_mission(mode: str) -> None:
     """Agent 0 crosses the place of agent 1, which hovers on the straight way between."""
-    hover = ("mission.kind=hover", "mission.duration_s=7", "sitl.start=air", f"separation.mode={mode}")
+    hover = (AT_100_HZ, "mission.kind=hover", "mission.duration_s=7", "sitl.start=air", f"separation.mode={mode}")
     starts = "start.positions_ned_m=[[0,0,-5],[2,0,-5]]"
     flight = Lockstep(load(None, ("swarm.agents=2", starts, *hover)))
     target = np.array([4.0, 0.0, -5.0])
@@ -100,7 +100,7 @@ def test_an_agent_goes_to_a_point_through_the_others_and_resume_continues_the_mi
 
 def in_the_air(height_m: float) -> Lockstep:
     """Return a flight of one agent that hovers in the air at its start and begins its mission."""
-    hover = ("swarm.agents=1", "mission.kind=hover", "mission.duration_s=3", "sitl.start=air")
+    hover = (*COARSE, "swarm.agents=1", "mission.kind=hover", "mission.duration_s=3", "sitl.start=air")
     flight = Lockstep(load(None, (*hover, f"start.positions_ned_m=[[0,0,{-height_m}]]")))
     fly_until(flight, lambda: phase(flight) is Phase.TRACK)
     return flight

@@ -13,7 +13,7 @@ from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Plan
-from tests.closed_loop.conftest import Flight, closer_than, fly_now
+from tests.closed_loop.conftest import FINE, Flight, closer_than, fly_now
 
 SWAP = ("swarm.agents=4", "start={positions_ned_m=[[4,0,0],[0,4,0],[-4,0,0],[0,-4,0]]}", "sitl.start=air")
 UNPROTECTED = ("agent.overload.widen_01=1", "agent.overload.hold_01=1", "agent.overload.clear_01=1")
@@ -31,7 +31,7 @@ def one_tick_of(count: int) -> Callable[[Lockstep], None]:
 def swapped(
     *more: str, until: Callable[[Lockstep], bool], at: dict[float, Callable[[Lockstep], None]], seed: int = 0
 ) -> Flight:
-    return fly_now(*SWAP, *more, config="swap8.toml", at=at, until=until, seed=seed)
+    return fly_now(FINE, *SWAP, *more, config="swap8.toml", at=at, until=until, seed=seed)
 
 
 def over(lockstep: Lockstep) -> bool:

@@ -16,9 +16,10 @@ from swarmctl.control.controllers.guard import Guard
 from swarmctl.control.reference.kinds.goto import GotoParams
 from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import ConfigError
-from tests.closed_loop.conftest import ROOT, Flight, closer_than, fly_now, mission_is_over
+from tests.closed_loop.conftest import AT_100_HZ, FINE, ROOT, Flight, closer_than, fly_now, mission_is_over
 
 HEAD_ON = (
+    AT_100_HZ,
     "swarm.agents=2",
     "sitl.start=air",
     "start.spacing_m=4",
@@ -109,7 +110,12 @@ def test_controllers_that_fail_are_caught_and_vehicles_brought_to_rest(told: dic
     [("own_pid", 0.1, 2), ("own_lqr", 0.1, 4), ("own_spiral", 0.05, 2)],  # less than 4 s do not reach its goal
 )
 def test_every_example_flies(name: str, rmse_m: float, duration_s: int) -> None:
-    short = ("sitl.start=air", f"mission.duration_s={duration_s}", *(() if name == "own_pid" else ("swarm.agents=1",)))
+    short = (
+        FINE,
+        "sitl.start=air",
+        f"mission.duration_s={duration_s}",
+        *(() if name == "own_pid" else ("swarm.agents=1",)),
+    )
     flight = fly_now(*short, config=f"examples/{name}.toml", until=mission_is_over)
     assert flight.outcomes == {"completed"}
     for agent in range(flight.config.swarm.agents):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from swarmctl.core.types import Mode, Phase
-from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
+from tests.closed_loop.conftest import FINE, Flight, Fly, fly_now, mission_is_over
 
 PERIOD_S, LENGTH_M, WIDTH_M = 12.0, 2.0, 1.0
 
@@ -29,6 +29,7 @@ def figure_8(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def own(path: Path) -> tuple[str, ...]:
     return (
+        FINE,
         "mission.kind=csv",
         f"mission.csv.files=['{path}']",
         f"mission.duration_s={PERIOD_S}",

@@ -13,7 +13,7 @@ import pytest
 from sitl.lockstep import Lockstep
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.peer_trajectories import PeerTrajectories
-from tests.closed_loop.conftest import Flight, fly_now
+from tests.closed_loop.conftest import Flight, fly_now, mission_t_s
 
 GUARANTEED = ("sitl.start=air", "separation.mode=guaranteed")
 TICKS = 130  # in which it lasts
@@ -22,7 +22,7 @@ TICKS = 130  # in which it lasts
 def flown(begin: Callable[[Lockstep], None]) -> Flight:
     """Return two and a half seconds of a swap of eight that begin when something does."""
     return fly_now(
-        *GUARANTEED, config="swap8.toml", at={1.0: begin}, until=lambda lockstep: lockstep.clock.now_us() > 10e6
+        *GUARANTEED, config="swap8.toml", at={1.0: begin}, until=lambda lockstep: mission_t_s(lockstep) > 3.6
     )
 
 

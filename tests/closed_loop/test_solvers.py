@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
+from tests.closed_loop.conftest import FINE, Flight, Fly, fly_now, mission_is_over
 
 DURATION_S = 10.0
-MISSION = (f"mission.duration_s={DURATION_S}", "sitl.start=air")
+MISSION = (FINE, f"mission.duration_s={DURATION_S}", "sitl.start=air")
 NUDGED = "start.positions_ned_m=[[-1.0,0.0,0.0],[0.0,0.001,0.0],[1.0,0.0,0.0]]"  # the second by 1 mm
 OSQP, DAQP = ("controller.mpc.qp.solver='osqp'", "controller.mpc.qp.solver='daqp'")
 

@@ -9,9 +9,9 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.core.types import PlanStatus
-from tests.closed_loop.conftest import COARSE, Flight, Fly, mission_is_over, mission_t_s
+from tests.closed_loop.conftest import COARSE, FINE, Flight, Fly, mission_is_over, mission_t_s
 
-SWAP = ("mission.duration_s=12", "sitl.start=air")  # from ten starts all agents arrive within 9.5 to 11.7 s
+SWAP = (FINE, "mission.duration_s=12", "sitl.start=air")  # from ten starts all agents arrive within 9.5 to 11.7 s
 
 
 def all_arrived(lockstep: Lockstep) -> bool:

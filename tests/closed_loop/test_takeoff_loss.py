@@ -12,13 +12,14 @@ from swarmctl.core.types import FlightMode, Phase
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.dialects.px4 import PX4
 from swarmctl.mavlink.vehicle import autopilot
+from tests.closed_loop.conftest import COARSE
 
 PHASES = [Phase.ARM, Phase.TAKEOFF]
 
 
 def died_in(phase: Phase) -> Lockstep:
     """Return a flight after the only agent of the vehicle died in the given phase: disarmed, or forty seconds later."""
-    flight = Lockstep(load(None, ["swarm.agents=1", "mission.duration_s=5"]))
+    flight = Lockstep(load(None, (*COARSE, "swarm.agents=1", "mission.duration_s=5")))
     entered_us: int | None = None
     while entered_us is None or flight.clock.now_us() < entered_us + (2_000_000 if phase is Phase.TAKEOFF else 60_000):
         flight.step()

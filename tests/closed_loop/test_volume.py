@@ -12,11 +12,12 @@ from swarmctl.config import Config, load
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.types import Mode, Phase
 from swarmctl.simulator_config import SimulatorConfig
-from tests.closed_loop.conftest import Flight, mission_is_over
+from tests.closed_loop.conftest import AT_100_HZ, Flight, mission_is_over
 
 CORNERS = "[[-2.5, -2.5], [2.5, -2.5], [2.5, 2.5], [-2.5, 2.5]]"
 VOLUME = (f"volume.corners_ne_m={CORNERS}", "volume.floor_z_m=1", "volume.ceiling_z_m=-3")
 CIRCLE = (  # of a radius that fits
+    AT_100_HZ,
     "swarm.agents=2",
     "sitl.start=air",
     "start.center_ned_m=[0, 0, -1]",
