@@ -209,7 +209,7 @@ def test_a_station_names_an_agent_that_died_on_the_ground(tmp_path: Path, monkey
 
 def test_a_station_that_comes_late_hears_who_has_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing else is heard of it any more, and its host is not over yet."""
-    path = write_swarm(tmp_path, duration_s=40.0)
+    path = write_swarm(tmp_path, duration_s=600.0)
     of_one_host, _, _ = path.read_text().replace("agents = [0]", "agents = [0, 1]").rpartition("[[hosts]]")
     path.write_text(of_one_host)
     make_keys(path, monkeypatch)
@@ -219,6 +219,9 @@ def test_a_station_that_comes_late_hears_who_has_died(tmp_path: Path, monkeypatc
         os.kill(alpha.pid_of("--id", "1"), signal.SIGKILL)
         assert until(lambda: "the vehicle of agent-1 is on the ground" in alpha.text(), READY_S), alpha.text()
         station = start("station")
+        assert until(lambda: "agent-0  TRACK" in station.text(), READY_S), station.text()
+        landed = station.verb("land", "0")
+        assert landed.returncode == 0, landed.stderr
         assert alpha.end() == 4, alpha.text()
         assert station.end() == 4, station.text()
         assert "agent-1 died before its vehicle was down" in station.summary()["violations"]
