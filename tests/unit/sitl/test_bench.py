@@ -25,8 +25,10 @@ SPEED_M_S = formation.RADIUS_M * formation.OMEGA_RAD_S
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without waiting until the agent has caught up."""
+    """Without waiting until the agent has caught up, and for no longer than it is asked to."""
     monkeypatch.setattr(ticks, "_WARM_UP_S", 0.1)
+    monkeypatch.setattr(scale, "_SETTLE_STEPS", 5)
+    monkeypatch.setattr(scale, "_LEAST_S", 0.4)
 
 
 @pytest.fixture(scope="module")
