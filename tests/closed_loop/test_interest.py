@@ -80,15 +80,19 @@ def head_on(*more: str) -> Flight:
     return to_goals(starts, starts[::-1], FAR, *more)
 
 
-def test_who_comes_from_out_of_reach_is_heard_in_full_before_it_matters() -> None:
-    flight = head_on()
-    assert oldest_path_s(flight) <= 2.5 * TICK_S
-    assert flight.separation_m() >= 0.85
-    assert not any("unresponsive" in flight.event_names(agent) for agent in range(2))
+@pytest.fixture(scope="module")
+def met() -> Flight:
+    return head_on()
 
 
-def test_a_peer_that_is_out_of_reach_is_no_concern_of_a_plan() -> None:
-    ticks = head_on().ticks(0)
+def test_who_comes_from_out_of_reach_is_heard_in_full_before_it_matters(met: Flight) -> None:
+    assert oldest_path_s(met) <= 2.5 * TICK_S
+    assert met.separation_m() >= 0.85
+    assert not any("unresponsive" in met.event_names(agent) for agent in range(2))
+
+
+def test_a_peer_that_is_out_of_reach_is_no_concern_of_a_plan(met: Flight) -> None:
+    ticks = met.ticks(0)
     ticks = ticks[np.isfinite(ticks["mission_t_s"])]
     apart_m = ticks["nearest_peer_m"][1:][(ticks["peers"][:-1] == 0) & (ticks["peers"][1:] == 1)]
     assert ticks["peers"][0] == 0 and len(apart_m)
