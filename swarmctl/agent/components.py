@@ -15,8 +15,9 @@ from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.sharing.interest import Interest
 from swarmctl.agent.sharing.telemetry_publisher import TelemetryPublisher
-from swarmctl.control.commit.commit_params import following
-from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
+from swarmctl.control.commit.commit_params import CommitParams, following
+from swarmctl.control.commit.reach import FarPeers
+from swarmctl.control.commit.trajectory_planner import INTERPOLATION_MARGIN_M, TrajectoryPlanner
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
@@ -35,19 +36,34 @@ def _best_effort(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> Se
 
 
 def _guaranteed(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> SeparationPolicy:
+    commit = setup.params.commit.for_vehicle(setup.vehicle_model)
     coordination = Coordination(
         agent=setup.agent,
         boot_id=setup.boot_id,
         peers=setup.peers,
-        params=setup.params.commit.for_vehicle(setup.vehicle_model),
+        params=commit,
         planner=_make_trajectory_planner(setup, ports.stopwatch_ns),
         separation=setup.separation,
         world_model=world_model,
         bus=ports.bus,
         note=ports.note,
         rate_hz=setup.params.rate_hz,
+        far_peers=_make_far_peers(setup, commit, world_model),
+        far_hz=setup.params.path_sharing.far_hz,
     )
     return Guaranteed(coordination, setup.mission.yaw_rad, ports.stopwatch_ns)
+
+
+def _make_far_peers(setup: AgentSetup, commit: CommitParams, world_model: WorldModel) -> FarPeers:
+    sharing, separation = setup.params.path_sharing, setup.separation
+    speed_m_s = sharing.speed_m_s if sharing.far_hz else 0.0
+    return FarPeers(
+        setup.peers,
+        speed_m_s=speed_m_s,
+        stretch_m=commit.stretch_m(speed_m_s),
+        apart_m=separation.downwash * (separation.budget.committed_m + INTERPOLATION_MARGIN_M),
+        ahead_us=world_model.clocks.ahead_us,
+    )
 
 
 def _make_trajectory_planner(setup: AgentSetup, stopwatch_ns: Stopwatch) -> TrajectoryPlanner:

@@ -199,10 +199,12 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
     identity = own_identity(config, process.identity) if process.identity else None
     others = [i for i in range(config.swarm.agents) if i != process.agent]
     peers = [agent_name(i) for i in others]
+    far = peers if config.agent.path_sharing.far_hz else []
     launcher = (topics.OPERATOR,)
     listen = {
         topics.PATH: peers,
-        topics.FAR_PATH: peers if config.agent.path_sharing.far_hz else [],
+        topics.FAR_PATH: far,
+        topics.FAR_TRAJECTORY: far,
         topics.STATUS: peers,
         topics.TRAJECTORY: peers,
         topics.RELAY: peers,

@@ -47,7 +47,9 @@ class PeerTrajectories:
         self._used_error_us: dict[str, int] = {}  # of the clock of each peer, since its trajectories were decoded anew
         self._stamps_us: dict[int, deque[int]] = {}  # of the last messages of each peer, oldest first
         self.newest: dict[int, TrajectoryMessage] = {}
+        self.telling: dict[int, TrajectoryMessage] = {}  # the newest of each peer that says what it has heard
         self.received_utc_us: dict[int, int] = {}  # when the newest message of each peer was accepted
+        self.confirmed_us: dict[int, int] = {}  # stamp of the newest own message that each peer says to have heard
         self.heard_before_flight: set[int] = set()  # peers that did not fly by commitments when first heard
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
@@ -67,6 +69,8 @@ class PeerTrajectories:
             if message.agent not in self.newest and not message.is_committed:
                 self.heard_before_flight.add(message.agent)
             self.newest[message.agent], self._memory[sender] = message, memory
+            if message.heard or message.agent not in self.telling:
+                self.telling[message.agent] = message
             self.received_utc_us[message.agent] = utc_us
             self._stamps_us.setdefault(message.agent, deque(maxlen=_STAMPS)).append(message.sent_utc_us)
             self._measure(message, utc_us)
@@ -92,19 +96,24 @@ class PeerTrajectories:
         said_us = message.sent_utc_us - self._clocks.ahead_us(message.agent)
         return said_us - (first_us - self._clocks.ahead_us(agent))
 
-    def heard(self) -> dict[int, tuple[int, int]]:
-        """Return stamp and arrival of the newest message of each peer."""
-        return {agent: (i.sent_utc_us, self.received_utc_us[agent]) for agent, i in self.newest.items()}
+    def heard(self, peers: Iterable[int]) -> dict[int, tuple[int, int]]:
+        """Return stamp and arrival of the newest message of some peers that were heard."""
+        newest, received_us = self.newest, self.received_utc_us
+        return {agent: (newest[agent].sent_utc_us, received_us[agent]) for agent in peers}
 
     def _measure(self, message: TrajectoryMessage, utc_us: int) -> None:
         self._clocks.received(message.agent, message.sent_utc_us, utc_us)
-        if self._agent in message.heard:
-            self._clocks.answered(message.agent, *message.heard[self._agent], utc_us)
+        if (times := message.heard.get(self._agent)) is not None:
+            stamp_us, arrival_us = times
+            self._clocks.answered(message.agent, stamp_us, arrival_us, utc_us)
+            self.confirmed_us[message.agent] = max(stamp_us, self.confirmed_us.get(message.agent, 0))
 
     def _refusal(self, sender: str, message: TrajectoryMessage, utc_us: int) -> str:
         if sender != agent_name(message.agent):
             return IDENTITY
         if message.agent not in self._verifiers:
             return UNKNOWN_PEER
-        begins_us = max(trajectory.t0_utc_us for trajectory in message.trajectories)
+        begins_us = message.committed.t0_utc_us
+        if message.proposal is not None:
+            begins_us = max(begins_us, message.proposal.trajectory.t0_utc_us)
         return FUTURE if begins_us > utc_us + MAX_BEGIN_US else ""

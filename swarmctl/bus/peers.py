@@ -108,6 +108,10 @@ class PeerPaths:
         self._near_since_us = {agent: self._near_since_us.get(agent, utc_us) for agent in within_reach}
         self._near = None
 
+    def is_near(self, agent: int) -> bool:
+        """Return whether a peer is within reach, whether or not a path of it was heard."""
+        return agent in self._near_since_us
+
     def near(self, before_utc_us: int | None = None) -> tuple[PredictedPath, ...]:
         """Return the newest paths of peers within reach, sorted by agent number; at first that is everybody.
 

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 from swarmctl.bus.bus import Bus, ForwardingBus, agent_name
-from swarmctl.bus.topics import RELAY, TOO_LONG, TRAJECTORY, Topic
+from swarmctl.bus.messages.commitment_messages import HeardTimes
+from swarmctl.bus.topics import FAR_TRAJECTORY, RELAY, TOO_LONG, TRAJECTORY, Topic
 from swarmctl.core.trajectory_message import TrajectoryMessage
 
 RELAY_VERSION = 1
@@ -70,9 +71,12 @@ class RelayingBus(ForwardingBus):
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
         """Return what has come since the last call, what was relayed first."""
         arrived = self._bus.receive(topic)
-        if topic is not TRAJECTORY:
+        if topic is TRAJECTORY:
+            found = [*self._relayed(), *arrived]
+        elif topic is FAR_TRAJECTORY:
+            found = arrived
+        else:
             return arrived
-        found = [*self._relayed(), *arrived]
         self._newest.update((sender, payload) for sender, payload in found if payload != TOO_LONG)
         return found
 
@@ -101,16 +105,19 @@ class RelayingBus(ForwardingBus):
 def missed_by_peers(
     own: int,
     newest: Mapping[int, TrajectoryMessage],
-    heard: Mapping[int, tuple[int, int]],
+    telling: Mapping[int, TrajectoryMessage],
+    received_us: Mapping[int, int],
     utc_us: int,
     *,
     period_us: int,
+    far_us: int,
     lacked_us: Callable[[TrajectoryMessage, int, int], int],
 ) -> list[int]:
     """Return the agents whose newest message this one has to pass on, since some peer has not heard them for a while.
 
     A peer is helped if, by its own clock, nothing of the other one has arrived for a while (however slow links are),
-    and what it lacks was sent a while before it said so (an agent that was held up itself is not missed).
+    and what it lacks was sent a while before it said so (an agent that was held up itself is not missed). The while is
+    longer where one of the two is far from the other, or the other one has nothing to say but to all.
     Of all who have what it lacks, two help at once, those that it hears first. Each further pair waits two periods
     longer, so that there is help whatever the first ones know, and messages do not grow with the number of agents:
     helpers that all help at once keep each other from hearing in time, and so from ever ending it.
@@ -118,39 +125,63 @@ def missed_by_peers(
     Args:
         own: number of this agent.
         newest: message of each peer.
-        heard: stamp of each peer's newest message and when it arrived here, as in its own message.
+        telling: the newest of each peer that says what it has heard.
+        received_us: when the newest arrived here.
         utc_us: now.
         period_us: of every agent's messages.
+        far_us: of those that the far ones hear, too; 0: all hear all.
         lacked_us: returns for how long, by its newest message, a peer has lacked what another sent after a stamp.
     """
-    found, least_us = set[int](), _RELAY_AFTER_PERIODS * period_us
-    for peer, message in newest.items():
-        if utc_us - heard[peer][1] > _HELPED_US:
+    found, near_us = set[int](), _RELAY_AFTER_PERIODS * period_us
+    rare_us = max(near_us, _RELAY_AFTER_PERIODS * far_us)
+    for peer, message in telling.items():
+        if utc_us - received_us[peer] > (period_us if far_us else _HELPED_US) or message is not newest[peer]:
+            continue  # where not every message says what was heard, each is looked at once
+        has_heard_all = len(message.heard) >= len(newest) - len(message.reach.far)
+        if far_us and has_heard_all and _heard_lately(message, rare_us if own in message.reach.far else near_us):
             continue
-        for agent, other in newest.items():
-            stamp_us, arrival_us = message.heard.get(agent, _NEVER)
+        heard = dict(message.heard.items())
+        for agent in _mentioned(message, newest):
+            other, (stamp_us, arrival_us) = newest[agent], heard.get(agent, _NEVER)
             silent_us = message.sent_utc_us - arrival_us
-            if silent_us <= least_us or other.sent_utc_us <= stamp_us or agent == peer or agent in found:
+            if silent_us <= near_us or other.sent_utc_us <= stamp_us or agent == peer or agent in found:
                 continue
+            is_rare = agent in message.reach.far or peer in other.reach.far or not other.is_committed
+            least_us = rare_us if is_rare else near_us
             waited_us = min(silent_us, lacked_us(message, agent, stamp_us) + period_us)
-            if waited_us > least_us + 2 * period_us * (_rank(own, peer, agent, newest, least_us) // 2):
+            if waited_us <= least_us:
+                continue
+            if waited_us > least_us + 2 * period_us * (_rank(own, peer, agent, telling, least_us) // 2):
                 found.add(agent)
     return sorted(found)
 
 
-def _rank(own: int, peer: int, agent: int, newest: Mapping[int, TrajectoryMessage], least_us: int) -> int:
+def _heard_lately(message: TrajectoryMessage, least_us: int) -> bool:
+    """Return whether the sender of a message has heard everybody it mentions within a while."""
+    heard = message.heard
+    oldest_us = heard.oldest_us if isinstance(heard, HeardTimes) else min(arrival for _, arrival in heard.values())
+    return message.sent_utc_us - oldest_us <= least_us
+
+
+def _mentioned(message: TrajectoryMessage, newest: Mapping[int, TrajectoryMessage]) -> Collection[int]:
+    """Return the agents of which a message says when they were heard, or, of those that are not far, that never."""
+    far = message.reach.far
+    return newest.keys() - (far - message.heard.keys()) if far else newest.keys()
+
+
+def _rank(own: int, peer: int, agent: int, telling: Mapping[int, TrajectoryMessage], least_us: int) -> int:
     """Return how many others are to help a peer before this agent: they have what it lacks, and it hears them.
 
     All come to the same order without a word, and to another one for each agent (rendezvous hashing, D. Thaler and
     C. Ravishankar 1996).
     """
-    message = newest[peer]
+    message = telling[peer]
     stamp_us = message.heard.get(agent, _NEVER)[0]
 
     def order(helper: int) -> tuple[bool, int]:
         is_heard = message.sent_utc_us - message.heard.get(helper, _NEVER)[1] <= least_us
         return not is_heard, zlib.crc32(struct.pack("<II", helper, agent))
 
-    able = (i for i, said in newest.items() if i not in (peer, agent) and said.heard.get(agent, _NEVER)[0] > stamp_us)
+    able = (i for i, said in telling.items() if i not in (peer, agent) and said.heard.get(agent, _NEVER)[0] > stamp_us)
     own_order = order(own)
     return sum(order(helper) < own_order for helper in able)

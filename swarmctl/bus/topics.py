@@ -6,7 +6,7 @@ are rows of `core.recorded.records`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 MAX_MISSION_BYTES = 65_536  # a tick reads it
 
@@ -19,6 +19,7 @@ class Topic:
     ring: int  # newest samples kept per sender; several, so that some broken ones don't displace the true one
     max_bytes: int  # longer messages are delivered as `TOO_LONG`
     reliable: bool
+    repeats: str = ""  # topic whose messages it carries, too: to seals and relays the two are one
 
 
 PATH = Topic(name="path", ring=8, max_bytes=4096, reliable=False)
@@ -31,9 +32,11 @@ ANSWER = Topic(name="answer", ring=16, max_bytes=4096, reliable=True)
 OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
 MISSION = Topic(name="mission", ring=4, max_bytes=MAX_MISSION_BYTES, reliable=True)
 TRAJECTORY = Topic(name="trajectory", ring=8, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
+FAR_TRAJECTORY = replace(TRAJECTORY, name="far_trajectory", repeats=TRAJECTORY.name)  # for those that are far, at times
 RELAY = Topic(name="relay", ring=4, max_bytes=60_000, reliable=False)  # trajectory messages of others
-TOPICS = (PATH, FAR_PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, MISSION, TRAJECTORY, RELAY)
-FOR_AGENTS = (PATH, FAR_PATH, STATUS, COMMAND, ENDED, OBSTACLES, MISSION, TRAJECTORY, RELAY)
+_COMMITMENTS = (TRAJECTORY, FAR_TRAJECTORY, RELAY)
+TOPICS = (PATH, FAR_PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, MISSION, *_COMMITMENTS)
+FOR_AGENTS = (PATH, FAR_PATH, STATUS, COMMAND, ENDED, OBSTACLES, MISSION, *_COMMITMENTS)
 
 TOO_LONG = b""  # replaces a message that is too long; every decoder refuses it
 

@@ -25,6 +25,7 @@ from swarmctl.mavlink.transport import Endpoint, parse_url
 
 _PAIRS_SHOWN = 3
 _HEARTBEATS = 4  # within the time after which a peer counts as silent: three may be missed in succession
+_LEAST_FAR_COMMITTED_HZ = 2.0  # a round trip, one message of it lost, lasts less than a lease
 _LEAST_FAR_HZ = 0.5  # two seconds, in which two vehicles may have come ten metres closer
 
 
@@ -54,10 +55,10 @@ def path_sharing_problems(sharing: PathSharingParams, separation: SeparationPara
             f"agent.path_sharing.far_hz = {sharing.far_hz:g}: allowed: 0, or {_LEAST_FAR_HZ:g} to 25; who is heard "
             "less often comes within reach by silence"
         )
-    if sharing.far_hz and separation.mode == "guaranteed":
+    elif 0.0 < sharing.far_hz < _LEAST_FAR_COMMITTED_HZ and separation.mode == "guaranteed":
         yield (
-            f"agent.path_sharing.far_hz = {sharing.far_hz:g} with separation.mode = 'guaranteed': commitments are not "
-            "predicted paths; set it to 0"
+            f"agent.path_sharing.far_hz = {sharing.far_hz:g} with separation.mode = 'guaranteed': allowed: 0, or "
+            f"{_LEAST_FAR_COMMITTED_HZ:g} to 25; who is heard less often has to acknowledge everything"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ class Proposal:
     made_utc_us: int
     agent: int
     trajectory: Trajectory
+    asks_far: bool = False  # whether the acknowledgements of those that are far are required, too
 
     @property
     def order(self) -> tuple[int, int]:
@@ -29,6 +31,24 @@ class Exclusions:
 
     suspected: frozenset[int] = frozenset()  # not heard for long
     promised: frozenset[int] = frozenset()  # to be excluded; they get no acknowledgement any more
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reach:
+    """Holds how far an agent may get unseen by those it is far from; the rules are in `swarmctl.control.commit.reach`.
+
+    Args:
+        far: peers whose acknowledgement it may do without.
+        speed_m_s: bound of the speed of what it commits to.
+        stretch_m: bound of the way from where it is to the end of that.
+    """
+
+    far: frozenset[int] = frozenset()
+    speed_m_s: float = math.inf
+    stretch_m: float = math.inf
+
+
+ANYWHERE = Reach()  # of an agent that requires the acknowledgements of all others
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,6 +66,7 @@ class TrajectoryMessage:
     acknowledged: Mapping[int, int]  # by peer: number of the proposal in its newest message
     exclusions: Exclusions
     heard: Mapping[int, tuple[int, int]]  # by peer: stamp of its newest message, and when that arrived by the own clock
+    reach: Reach = ANYWHERE
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:

@@ -15,7 +15,7 @@ from sitl.studies.campaign.conditions.events import Freeze, ScenarioEvent, Split
 from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight, drawn
 from sitl.studies.campaign.trials import Trial
-from swarmctl.agent.planning import coordination
+from swarmctl.agent.planning import commitment_publisher, coordination
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.bus.bus import agent_name
@@ -163,7 +163,7 @@ def test_the_others_arrive_once_the_vehicle_of_a_frozen_agent_has_landed(landed:
 def test_all_arrive_although_links_fail_for_seconds(relayed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each direction between two agents delivers nothing for two fifths of the time, 2 s at once."""
     if not relayed:
-        monkeypatch.setattr(coordination, "missed_by_peers", lambda *_, **__: [])
+        monkeypatch.setattr(commitment_publisher, "missed_by_peers", lambda *_, **__: [])
     cell = replace(GUARANTEED_SWAP, disturbance="bursts:0.4")
     flight = TrialFlight(Trial(cell, 2), replace(drawn(cell, 2), limit_s=12.0))
     flight.run()

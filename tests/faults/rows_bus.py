@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from swarmctl.agent.planning import coordination
+from swarmctl.agent.planning import commitment_publisher, coordination
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.bus import peers
 from swarmctl.bus.local import inboxes
@@ -190,7 +190,7 @@ ROWS = (
             happens=cut(between(one, other), 5.0),
             reacts=arrived,
             lasts_s=16.5,
-            off=Off(patches=((coordination, "missed_by_peers", lambda *_, **__: []),)),
+            off=Off(patches=((commitment_publisher, "missed_by_peers", lambda *_, **__: []),)),
         )
         for a, b, one, other in (
             ("alpha", "bravo", (0,), (1, 2)),
@@ -220,7 +220,7 @@ ROWS = (
         happens=cut([(VICTIM, 0)], 7.0),
         reacts=arrived,
         lasts_s=7.5,
-        off=Off(patches=((coordination, "missed_by_peers", lambda *_, **__: ()),)),
+        off=Off(patches=((commitment_publisher, "missed_by_peers", lambda *_, **__: ()),)),
     ),
     SimulatedRow(
         name="isolated-2.5s",

@@ -8,27 +8,28 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
+from swarmctl.agent.planning.commitment_publisher import CommitmentPublisher
 from swarmctl.agent.sensing.deviations import Deviations
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.commitment_messages import encode_trajectory_message
 from swarmctl.bus.peer_trajectories import PeerTrajectories
-from swarmctl.bus.relay import missed_by_peers
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.membership import Membership
-from swarmctl.control.commit.protocol import CommitCounts, Commitments, acknowledgements
+from swarmctl.control.commit.protocol import CommitCounts, Commitments
+from swarmctl.control.commit.reach import FarPeers
 from swarmctl.control.commit.situation import DesiredReference, Situation, slowed
 from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.commit.tube import Grip, Tube
 from swarmctl.core.trajectory import Times, Trajectory
-from swarmctl.core.trajectory_message import TrajectoryMessage
+from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import MAX_MARGIN_M, Array, Phase, VehicleState
 
 _SUSPECT_US = 5_000_000  # without a message, after which a peer is suspected: bursts of loss end sooner
 _GAP_US = 1_000_000  # without a fresh state, after which nothing is committed any more
+_FASTER_01 = 1.1  # of the speed at which somebody else flies the vehicle, which may grow until the next message
 _SAME_M = 1e-3  # tubes that differ by less are equal: messages round
 _CUT_OFF_US = 20_000_000  # at rest without the acknowledgements required, after which the agent lands where it is
 
@@ -45,13 +46,16 @@ class Coordination:
         world_model: paths, statuses and presence of peers, and obstacles.
         bus: is drained by `receive`.
         rate_hz: tick rate of every agent.
+        far_peers: chooses the peers whose acknowledgements can be done without.
+        far_hz: how often those are told; 0: nobody is far.
         note: is told `conflicting_commitment` when a peer's committed trajectory comes too close to the own one;
             `tracking_violation` when the vehicle leaves its tube, when that has another consequence, and when it is
             held again; `membership` when the peers that are suspected, promised to be excluded, or excluded change;
             and `commitments` with all counts when the autopilot or a pilot takes over.
 
     Attributes:
-        committed_peers: by agent number, the trajectories that each peer relied on may follow. A silent peer is relied
+        committed_peers: by agent number, the trajectories that each peer within reach may follow, if it is relied on.
+            A silent peer is relied
             on as well: it rests where its last commitment ends, also when a majority has excluded it.
         lost_peer_keep_outs: keep-outs at the ends of lost peers' committed trajectories.
         cut_off: why the agent has to land where it is: it waits for peers in vain, or they have excluded it; or "".
@@ -71,16 +75,24 @@ class Coordination:
         bus: Bus,
         note: Callable[..., None],
         rate_hz: float,
+        far_peers: FarPeers,
+        far_hz: float,
     ) -> None:
-        self._agent, self._boot_id, self._bus, self._world_model = agent, boot_id, bus, world_model
+        self._agent, self._bus, self._world_model = agent, bus, world_model
         self._commitments = Commitments(agent, params, planner)
         refusals, presence = world_model.refusals, world_model.presence
         self._peer_trajectories = PeerTrajectories(
             peers, rate_hz, refusals, presence, agent=agent, clocks=world_model.clocks
         )
         self._peers = frozenset(peers)
-        self._note, self._seq, self._separation = note, 0, separation
-        self._period_us = round(1e6 / rate_hz)
+        self._note, self._separation = note, separation
+        self._far_peers = far_peers
+        self._publisher = CommitmentPublisher(
+            agent, boot_id, bus, self._peer_trajectories, far_peers, rate_hz=rate_hz, far_hz=far_hz
+        )
+        self._spared: frozenset[int] = frozenset()  # peers whose acknowledgement of the proposal is not required
+        self._hears = self._peers  # every message of these
+        self._others_m_s = 0.0  # speed at which somebody else flies the vehicle
         self._is_committed = False
         self._tube_m = separation.budget.tube_m
         self._tube = Tube(self._tube_m)
@@ -109,13 +121,27 @@ class Coordination:
 
     def receive(self, utc_us: int) -> None:
         """Apply rule 1: take in every message that has arrived, and what it says about silent peers."""
-        for sender, payload in self._bus.receive(topics.TRAJECTORY):
-            self._peer_trajectories.offer(sender, payload, utc_us)
+        for topic in (topics.FAR_TRAJECTORY, topics.TRAJECTORY):
+            for sender, payload in self._bus.receive(topic):
+                self._peer_trajectories.offer(sender, payload, utc_us)
         self._update_membership(utc_us)
+        self._attend(utc_us)
+
+    def _attend(self, utc_us: int) -> None:
+        """Hear every message of the peers that are not far, and of those to which this agent is not."""
+        own, newest = self._commitments.trajectories, self._peer_trajectories.newest
+        if not self._far_peers.enabled or not own:
+            return
+        if not self._far_peers.update(own, newest, utc_us):
+            return
+        hears = self._far_peers.near | {agent for agent, i in newest.items() if self._agent not in i.reach.far}
+        if hears != self._hears:
+            self._hears = hears
+            self._bus.hear(topics.TRAJECTORY, [agent_name(agent) for agent in sorted(hears)])
 
     def _update_membership(self, utc_us: int) -> None:
         peers, membership = self._peer_trajectories, self._membership
-        self._ended = frozenset(agent for agent in self._peers if self._world_model.has_ended(agent))
+        self._ended = self._world_model.ended
         suspected = self._suspected(utc_us)
         told = {agent: message.exclusions for agent, message in peers.newest.items()}
         membership.update(suspected, told, self._ended, votes=peers.heard_before_flight == self._peers)
@@ -145,13 +171,17 @@ class Coordination:
         """
         commitments = self._commitments
         if not self._is_committed:
-            self._is_committed, self._begun_us = True, utc_us
+            self._is_committed, self._begun_us, self._others_m_s = True, utc_us, 0.0
             commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
         since_us, self._stepped_us = utc_us - self._stepped_us, utc_us
         self._watch(utc_us, since_us, state)
-        known, required = self._peer_trajectories.newest, self._required_peers()
-        self.cut_off = self._why_cut_off(utc_us, required)
-        commitments.update(utc_us, known, required)
+        required, newest = self._required_peers(), self._peer_trajectories.newest
+        known = self._near_messages()
+        self._spare(utc_us)
+        asked, near = required - self._spared, self._far_peers.near
+        self.cut_off = self._why_cut_off(utc_us, asked & near if commitments.proposal is None else asked)
+        if commitments.proposal is not None:
+            commitments.update(utc_us, {a: i for a, i in newest.items() if a not in self._spared}, asked)
         relied_on = self._relied_on(utc_us, known, required)
         begin_us = utc_us + commitments.lead_us
         now = Situation(
@@ -163,12 +193,43 @@ class Coordination:
             disturbance_ned_m_s2=disturbance_ned_m_s2,
         )
         commitments.evade(now)
-        unsure = {a for a in required if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
+        unsure = {a for a in required & near if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
         self.alert = self._why_slow(unsure)
         if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
             heard = (relied_on & required) - self._absent()
             others = self._others(begin_us, state, phase, heard, self._entered_ahead)
             commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
+            self._spare(utc_us)
+            commitments.keep_clear_of(
+                {agent: i for agent, i in newest.items() if agent not in known and agent not in self._spared}, utc_us
+            )
+
+    def _near_messages(self) -> Mapping[int, TrajectoryMessage]:
+        """Return the newest messages of the peers that are not far, to which alone trajectories can come close."""
+        newest, near = self._peer_trajectories.newest, self._far_peers.near
+        return newest if len(near) == len(self._peers) else {agent: i for agent, i in newest.items() if agent in near}
+
+    def _spare(self, utc_us: int) -> None:
+        """Choose the peers whose acknowledgement of a new proposal is not required."""
+        proposal, peers = self._commitments.proposal, self._peer_trajectories
+        self._spared = frozenset()
+        if proposal is not None and self._far_peers.enabled:
+            self._spared = self._far_peers.spared(proposal.trajectory, peers.newest, peers.confirmed_us, utc_us)
+            self._ask_far(proposal)
+
+    def _still_spared(self, utc_us: int) -> frozenset[int]:
+        """Return the peers whose acknowledgement of the proposal is not required, by what they have said since."""
+        proposal = self._commitments.proposal
+        if proposal is not None and self._spared:
+            newest = self._peer_trajectories.newest
+            self._spared = self._far_peers.still_spared(self._spared, proposal.trajectory, newest, utc_us)
+            self._ask_far(proposal)
+        return self._spared
+
+    def _ask_far(self, proposal: Proposal) -> None:
+        """Mark a proposal whose acknowledgement is required of a far peer."""
+        if not proposal.asks_far and not self._peers - self._far_peers.near <= self._spared:
+            self._commitments.proposal = replace(proposal, asks_far=True)
 
     def _relied_on(self, utc_us: int, known: Mapping[int, TrajectoryMessage], required: Set[int]) -> Set[int]:
         """Return the peers whose commitments are relied on, and remember where lost ones end.
@@ -187,7 +248,7 @@ class Coordination:
         lost_peers = [agent for agent in known.keys() - required if agent in committed]
         self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
         relied_on = (required | self._membership.excluded - self._ended) & committed - conflicting - deviating
-        self.committed_peers = {agent: known[agent].followed for agent in relied_on}
+        self.committed_peers = {a: known[a].followed for a in relied_on if self._world_model.paths.is_near(a)}
         return relied_on
 
     def wait(self, utc_us: int, state: VehicleState | None) -> None:
@@ -206,6 +267,7 @@ class Coordination:
             self.committed_peers, self.lost_peer_keep_outs, self.cut_off, self.alert = {}, [], "", ""
             self._note("commitments", **asdict(self.counts), worst_tracking_m=self.worst_tracking_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
+        self._others_m_s = math.inf if state is None else _FASTER_01 * float(np.linalg.norm(state.vel_ned_m_s))
 
     def sample_committed(self, t_utc_us: Times) -> tuple[Array, Array]:
         """Return the positions and velocities, (M, 3) NED each, to fly at times (M,)."""
@@ -221,36 +283,24 @@ class Coordination:
             unsure_m: by how much more the vehicle may be away from its estimate than distances leave room for. Peers
                 keep it from its path already; they do so while it may be outside its tube.
         """
-        if self._commitments.committed is None:
+        commitments, exclusions = self._commitments, self._membership.exclusions
+        committed, proposal = commitments.committed, commitments.proposal
+        if committed is None:
             return
-        self._seq += 1
-        exclusions = self._membership.exclusions
-        message = TrajectoryMessage(
-            agent=self._agent,
-            boot_id=self._boot_id,
-            seq=self._seq,
-            sent_utc_us=utc_us,
-            is_committed=self._is_committed,
-            committed=self._commitments.committed,
-            tube_m=max(self._tube.radius_m, min(MAX_MARGIN_M, self._error_m + unsure_m)),
-            proposal=self._commitments.proposal,
-            acknowledged=acknowledgements(self._peer_trajectories.newest, self._ended | exclusions.promised),
-            exclusions=exclusions,
-            heard=self._peer_trajectories.heard(),
-        )
-        self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
-        if not relays:
-            return
-        peers = self._peer_trajectories
-        missed = missed_by_peers(
-            self._agent,
-            peers.newest,
-            message.heard,
+        self._publisher.publish(
             utc_us,
-            period_us=self._period_us,
-            lacked_us=peers.lacked_us,
+            is_committed=self._is_committed,
+            committed=committed,
+            proposal=proposal,
+            tube_m=max(self._tube.radius_m, min(MAX_MARGIN_M, self._error_m + unsure_m)),
+            exclusions=exclusions,
+            reach=self._far_peers.reach(
+                commitments.trajectories, away_m=commitments.late_m(utc_us), speed_m_s=self._others_m_s
+            ),
+            refused=self._ended | exclusions.promised,
         )
-        self._bus.relay(missed)
+        if relays:
+            self._publisher.relay(utc_us)
 
     @property
     def is_held(self) -> bool:
@@ -286,8 +336,15 @@ class Coordination:
             self._note("tracking_violation", begins=is_off, error_m=error_m, allowed_m=self._tube_m, grip=grip)
 
     def _required_peers(self) -> frozenset[int]:
-        """Return peers that fly by commitments and have to acknowledge."""
-        participants = self._peers - self._membership.excluded - self._ended
+        """Return peers that fly by commitments and have to acknowledge what they are not spared.
+
+        One that was excluded while this agent was far from it may have committed to something unseen.
+        """
+        excluded = self._membership.excluded
+        if excluded and self._far_peers.enabled:
+            newest = self._peer_trajectories.newest
+            excluded = frozenset(a for a in excluded if a not in newest or self._agent not in newest[a].reach.far)
+        participants = self._peers - excluded - self._ended
         return frozenset(agent for agent in participants if self._world_model.uses_commitments(agent))
 
     def _absent(self) -> set[int]:

@@ -79,6 +79,7 @@ class WorldModel:
         self._unresponsive_since_us: dict[int, int] = {}
         self._status: dict[int, StatusMessage] = {}
         self._status_us: dict[int, int] = {}  # UTC of the newest one's arrival
+        self._ended: frozenset[int] | None = frozenset()  # peers that have; None: to be found out anew
         self.obstacles = KnownObstacles(note)
 
     def receive(self, utc_us: int) -> list[Order]:
@@ -112,6 +113,7 @@ class WorldModel:
         if refusal:
             self.refusals.add(sender, topics.ENDED.name, refusal, utc_us)
         if ended is not None:
+            self._ended = None
             self._note("peer_ended", agent=ended.agent, boot_id=ended.boot_id, is_down=ended.is_down)
 
     def answer(self, order: Order, refusal: str, comes_to: str = "") -> None:
@@ -138,7 +140,7 @@ class WorldModel:
         elif self._verifiers[status.agent].accepts(
             ReceivedMessage(status.boot_id, status.ticks, status.utc_us, payload), utc_us
         ):
-            self._status[status.agent], self._status_us[status.agent] = status, utc_us
+            self._status[status.agent], self._status_us[status.agent], self._ended = status, utc_us, None
 
     def _watch_unresponsive(self, utc_us: int) -> None:
         """Report peers that are on the bus but whose paths have not been accepted for too long."""
@@ -247,6 +249,7 @@ class WorldModel:
     def exclude(self, agent: int) -> None:
         """Believe that the process of a peer has ended; another process under its number takes part again."""
         self._ends.vouch(agent, self._boot_id(agent))
+        self._ended = None
 
     def life_sign(self, agent: int, utc_us: int) -> str:
         """Return what speaks against an operator's word that a peer has ended: it was just heard; or ""."""
@@ -262,6 +265,13 @@ class WorldModel:
         missing liveliness token is none: the peer may be cut off.
         """
         return self._ends.has_ended(agent, self._boot_id(agent)) or self._is_in(agent, Phase.DONE)
+
+    @property
+    def ended(self) -> frozenset[int]:
+        """Return the peers that have, see `has_ended`."""
+        if self._ended is None:
+            self._ended = frozenset(agent for agent in self._verifiers if self.has_ended(agent))
+        return self._ended
 
     @property
     def excused(self) -> frozenset[int]:

@@ -1,35 +1,75 @@
 """Trajectory messages of `swarmctl.control.commit.protocol`: their encoding.
 
 The layout is little-endian: a header, the committed trajectory, a proposal if there is one, acknowledgements (agent,
-number), what was heard (agent, stamp, arrival), and the numbers of agents that are suspected, then of those to be
-excluded. A trajectory is t0, step and count, then positions and velocities as float32.
+number), what was heard (agent, stamp, arrival), and the numbers of agents that are suspected, of those to be excluded,
+and of those that are far. A trajectory is t0, step and count, then positions and velocities as float32.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import ItemsView, Iterator, Mapping
 
 import numpy as np
 
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
+from swarmctl.core.trajectory_message import Exclusions, Proposal, Reach, TrajectoryMessage
 from swarmctl.core.types import Array
 
-TRAJECTORY_VERSION = 4
+TRAJECTORY_VERSION = 5
 MAX_TUBE_M = 100.0
 MAX_POINTS = 2000
 MAX_STEP_US = 500_000
-MAX_PEERS = 256  # of each kind: acknowledged, heard, suspected, promised
+MAX_PEERS = 256  # of each kind: acknowledged, heard, suspected, promised, far
 _MAGIC = b"SI"
-_HEADER = struct.Struct("<2sBBIIIqfHHHH")  # magic version flags agent boot seq sent tube, counts of the four kinds
-_HAS_PROPOSAL, _IS_COMMITTED = 1, 2
+_HEADER = struct.Struct("<2sBBIIIqfffHHHHH")  # magic version flags agent boot seq sent tube reach, counts of the kinds
+_HAS_PROPOSAL, _IS_COMMITTED, _ASKS_FAR = 1, 2, 4
+_FLAGS = _HAS_PROPOSAL | _IS_COMMITTED | _ASKS_FAR
 _PROPOSAL = struct.Struct("<Qq")  # number, time of proposal
 _TRAJECTORY = struct.Struct("<qiH2x")
 _ACKNOWLEDGEMENT = struct.Struct("<IQ")
 _HEARD = struct.Struct("<Iqq")
+_HEARD_DTYPE = np.dtype([("agent", "<u4"), ("stamp_us", "<i8"), ("arrival_us", "<i8")])
 _AGENT = struct.Struct("<I")
 
 Memory = dict[bytes, Trajectory]  # decoded trajectories by their bytes
+
+
+class HeardTimes(Mapping[int, tuple[int, int]]):
+    """Reads what a message says was heard, where it is looked for: most of it is not.
+
+    Args:
+        encoded: as in the message.
+    """
+
+    def __init__(self, encoded: bytes) -> None:
+        self._encoded = encoded
+
+    @property
+    def oldest_us(self) -> int:
+        """Return the earliest arrival of all; 0 if nobody was heard."""
+        arrivals = np.frombuffer(self._encoded, _HEARD_DTYPE)["arrival_us"]
+        return int(arrivals.min()) if len(arrivals) else 0
+
+    def __getitem__(self, agent: int) -> tuple[int, int]:
+        key = _AGENT.pack(agent)
+        at = self._encoded.find(key)
+        while at % _HEARD.size:  # also when it is not found: -1
+            if at < 0:
+                raise KeyError(agent)
+            at = self._encoded.find(key, at + 1)
+        _, stamp_us, arrival_us = _HEARD.unpack_from(self._encoded, at)
+        return stamp_us, arrival_us
+
+    def __iter__(self) -> Iterator[int]:
+        return (agent for agent, _, _ in _HEARD.iter_unpack(self._encoded))
+
+    def __len__(self) -> int:
+        return len(self._encoded) // _HEARD.size
+
+    def items(self) -> ItemsView[int, tuple[int, int]]:
+        """Return all at once."""
+        return {agent: (stamp, arrival) for agent, stamp, arrival in _HEARD.iter_unpack(self._encoded)}.items()
 
 
 def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
@@ -38,16 +78,19 @@ def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
         _HEADER.pack(
             _MAGIC,
             TRAJECTORY_VERSION,
-            _HAS_PROPOSAL * (message.proposal is not None) | _IS_COMMITTED * message.is_committed,
+            _flags(message),
             message.agent,
             message.boot_id,
             message.seq,
             message.sent_utc_us,
             message.tube_m,
+            message.reach.speed_m_s,
+            message.reach.stretch_m,
             len(message.acknowledged),
             len(message.heard),
             len(message.exclusions.suspected),
             len(message.exclusions.promised),
+            len(message.reach.far),
         ),
         _encode_trajectory(message.committed),
     ]
@@ -56,7 +99,7 @@ def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
         parts.append(_encode_trajectory(message.proposal.trajectory))
     parts += [_ACKNOWLEDGEMENT.pack(agent, number) for agent, number in sorted(message.acknowledged.items())]
     parts += [_HEARD.pack(agent, *stamps) for agent, stamps in sorted(message.heard.items())]
-    for agents in (message.exclusions.suspected, message.exclusions.promised):
+    for agents in (message.exclusions.suspected, message.exclusions.promised, message.reach.far):
         parts += [_AGENT.pack(agent) for agent in sorted(agents)]
     return b"".join(parts)
 
@@ -71,12 +114,13 @@ def decode_trajectory_message(
     which its trajectories are converted, give or take `error_us`; the memory must be of the same correction.
     """
     try:
-        magic, version, flags, agent, boot_id, seq, sent_utc_us, tube_m, *counts = _HEADER.unpack_from(payload)
-        if magic != _MAGIC or version != TRAJECTORY_VERSION or flags > 3 or max(counts) > MAX_PEERS:
+        magic, version, flags, agent, boot_id, seq, sent_utc_us, *numbers = _HEADER.unpack_from(payload)
+        (tube_m, speed_m_s, stretch_m), counts = numbers[:3], numbers[3:]
+        if magic != _MAGIC or version != TRAJECTORY_VERSION or flags > _FLAGS or max(counts) > MAX_PEERS:
             return None
-        if not 0.0 <= tube_m <= MAX_TUBE_M:
+        if not 0.0 <= tube_m <= MAX_TUBE_M or not speed_m_s >= 0.0 or not stretch_m >= 0.0:
             return None
-        acknowledgements, heard, suspected, promised = counts
+        acknowledgements, heard, suspected, promised, far = counts
         known, sent = memory or {}, Memory()
         clock = (ahead_us, error_us)
         committed, at = _decode_trajectory(payload, _HEADER.size, known, sent, clock)
@@ -84,14 +128,21 @@ def decode_trajectory_message(
         if flags & _HAS_PROPOSAL:
             number, made_utc_us = _PROPOSAL.unpack_from(payload, at)
             trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, sent, clock)
-            proposal = Proposal(number=number, made_utc_us=made_utc_us, agent=agent, trajectory=trajectory)
+            proposal = Proposal(
+                number=number,
+                made_utc_us=made_utc_us,
+                agent=agent,
+                trajectory=trajectory,
+                asks_far=bool(flags & _ASKS_FAR),
+            )
         heard_at = at + acknowledgements * _ACKNOWLEDGEMENT.size
         agents_at = heard_at + heard * _HEARD.size
-        if len(payload) != agents_at + (suspected + promised) * _AGENT.size:
+        if len(payload) != agents_at + (suspected + promised + far) * _AGENT.size:
             return None
         acknowledged = dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:heard_at]))
         agents = [number for (number,) in _AGENT.iter_unpack(payload[agents_at:])]
-        exclusions = Exclusions(suspected=frozenset(agents[:suspected]), promised=frozenset(agents[suspected:]))
+        far_at = suspected + promised
+        exclusions = Exclusions(suspected=frozenset(agents[:suspected]), promised=frozenset(agents[suspected:far_at]))
         if memory is not None:
             memory.clear()
             memory.update(sent)
@@ -106,10 +157,18 @@ def decode_trajectory_message(
             proposal=proposal,
             acknowledged=acknowledged,
             exclusions=exclusions,
-            heard={a: (sent_, at_) for a, sent_, at_ in _HEARD.iter_unpack(payload[heard_at:agents_at])},
+            heard=HeardTimes(payload[heard_at:agents_at]),
+            reach=Reach(far=frozenset(agents[far_at:]), speed_m_s=speed_m_s, stretch_m=stretch_m),
         )
     except (struct.error, ValueError):
         return None
+
+
+def _flags(message: TrajectoryMessage) -> int:
+    flags = _IS_COMMITTED * message.is_committed
+    if message.proposal is not None:
+        flags |= _HAS_PROPOSAL | _ASKS_FAR * message.proposal.asks_far
+    return flags
 
 
 def _encode_trajectory(trajectory: Trajectory) -> bytes:

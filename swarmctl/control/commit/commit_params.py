@@ -10,6 +10,7 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 
 _FOLLOWING_MOVES_Z = 10
+_MODEST_LEAD_S = 0.5  # proposals with a longer lead may be longer than others count on
 
 
 class CommitParams(Params):
@@ -29,6 +30,10 @@ class CommitParams(Params):
     right_of_way_rad: float = Field(1.0, ge=0, le=1.2)  # overrides `separation`: plans with stops lock sooner
     stuck_m: float = Field(1.0, gt=0, le=10)  # overrides `separation`: agents that meet turn while they still move
     follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # tracks commitments to the centimetre
+
+    def stretch_m(self, speed_m_s: float) -> float:
+        """Return the length [m] of the longest proposal that is no faster than this, with its final braking."""
+        return speed_m_s * (self.horizon * self.dt_s + _MODEST_LEAD_S) + 0.5 * speed_m_s**2 / self.brake_m_s2
 
     def for_vehicle(self, vehicle: VehicleModelParams) -> CommitParams:
         """Return parameters by which a proposal leaves what is committed no sooner than the vehicle can.

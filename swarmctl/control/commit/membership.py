@@ -75,6 +75,8 @@ class Membership:
         if not votes:
             return
         self._suspected = frozenset(suspected)
+        if not suspected and not self._promised and not any(exclusions.promised for exclusions in told.values()):
+            return  # as nearly always
         for agent in sorted(told):
             others = told[agent].promised
             if agent not in self._promised and self._agent not in others:

@@ -5,7 +5,8 @@ leaves the committed one a little later, keeps its distance to everything its pe
 to propose, and ends at rest again. It commits to the proposal only when every participant has acknowledged it. Each
 agent sends all of this in one message a tick (committed trajectory, proposal, acknowledgements), and only the newest
 message counts. Who has it passes it on to those that lack it (`swarmctl.bus.relay`): for what follows, such a message
-has only been under way for longer.
+has only been under way for longer. In wide swarms agents that are far from each other do without acknowledgements, by
+rules of their own (`swarmctl.control.commit.reach`).
 
 Each tick applies these rules in this order:
 
@@ -59,6 +60,7 @@ The proof rests on these assumptions, each of which is watched in flight:
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
@@ -263,6 +265,29 @@ class Commitments:
         self._cleared = {id(known): known for known in now.followed}
         self._proposed_late_us = self._late_us
         self.counts.proposed += 1
+
+    def keep_clear_of(self, peers: Mapping[int, TrajectoryMessage], utc_us: int) -> None:
+        """Apply rule 4 to peers that were left out of the plan: withdraw a proposal that is not clear of them, too."""
+        if self.proposal is None or not peers:
+            return
+        known = [trajectory for message in peers.values() for trajectory in message.followed]
+        if self._planner.conflicts(self.proposal.trajectory, utc_us, known):
+            self.proposal = None
+            self.counts.withdrawn += 1
+        else:
+            self._cleared.update((id(trajectory), trajectory) for trajectory in known)
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """Return the committed trajectory, and the proposed one if there is one; none before the first."""
+        proposed = () if self.proposal is None else (self.proposal.trajectory,)
+        return proposed if self.committed is None else (self.committed, *proposed)
+
+    def late_m(self, utc_us: int) -> float:
+        """Return how far what is flown is behind what is committed [m]."""
+        if self.committed is None or not self._late_us:
+            return 0.0
+        return math.dist(self.committed.at(utc_us)[0], self.committed.at(utc_us - self._late_us)[0])
 
     @property
     def flown(self) -> Trajectory | None:

@@ -35,7 +35,7 @@ _OUTWARD_TOLERANCE_M = (
     0.01  # farther out of the flight volume allowed to proposals of a vehicle that is outside already
 )
 _APPROACH_TOLERANCE_M = 0.001  # approach allowed to trajectories that are too close already
-_INTERPOLATION_MARGIN_M = 0.01  # kept by proposals on top: they are checked as straight lines between points
+INTERPOLATION_MARGIN_M = 0.01  # kept by proposals on top: they are checked as straight lines between points
 
 
 class TrajectoryPlanner:
@@ -152,7 +152,7 @@ class TrajectoryPlanner:
         yield self.stopping_candidate(committed, now.begin_us, now.utc_us)
         heights_m = [k.radius_m for k in now.others if not k.any_height]
         if heights_m:
-            yield self._climbing_candidate(committed, now.begin_us, max(heights_m) + _INTERPOLATION_MARGIN_M)
+            yield self._climbing_candidate(committed, now.begin_us, max(heights_m) + INTERPOLATION_MARGIN_M)
 
     def _climbing_candidate(self, committed: Trajectory, begin_us: int, height_m: float) -> Trajectory:
         """Return the committed trajectory, left at `begin_us` for a climb by `height_m` over where it would stop."""
@@ -243,7 +243,7 @@ class TrajectoryPlanner:
         whole = joined(committed, leaving, now.utc_us)
         if not self._stays_in_volume(whole, committed, now.utc_us) or not self.is_clear(whole, now):
             return None
-        return None if self.conflicts(whole, now.utc_us, now.followed, _INTERPOLATION_MARGIN_M) else whole
+        return None if self.conflicts(whole, now.utc_us, now.followed, INTERPOLATION_MARGIN_M) else whole
 
     def _stays_in_volume(self, trajectory: Trajectory, committed: Trajectory, utc_us: int) -> bool:
         """Tell whether a trajectory stays in the flight volume, or goes no farther out of it than `committed` does."""

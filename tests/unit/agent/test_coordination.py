@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,18 +20,20 @@ from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.commit_params import CommitParams
+from swarmctl.control.commit.reach import FarPeers
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import resting
-from swarmctl.core.trajectory_message import Exclusions, Proposal
+from swarmctl.core.trajectory_message import ANYWHERE, Exclusions, Proposal, Reach
 from swarmctl.core.types import Array, Phase, VehicleState
 from tests import builders
 
 PEER = agent_name(1)
 RATE_HZ = 50.0
+_SPEED_M_S, _STRETCH_M = 2.0, 6.0
 HERE = np.array([0.0, 0.0, -2.0])
 PLACE = np.array([3.0, 0.0, -2.0])  # of the peer
 
@@ -38,7 +41,7 @@ PLACE = np.array([3.0, 0.0, -2.0])  # of the peer
 class Bench:
     """One agent, and a peer that is only its messages."""
 
-    def __init__(self) -> None:
+    def __init__(self, far_hz: float = 0.0) -> None:
         self.clock, self.told = SimClock(), list[tuple[str, dict[str, Any]]]()
         hub = LocalHub(self.clock.now_us, 1)
         self.bus = hub.connect(agent_name(0))
@@ -62,12 +65,22 @@ class Bench:
             bus=self.bus,
             note=lambda name, **fields: self.told.append((name, fields)),
             rate_hz=RATE_HZ,
+            far_peers=FarPeers(
+                [1],
+                speed_m_s=_SPEED_M_S if far_hz else 0.0,
+                stretch_m=_STRETCH_M,
+                apart_m=1.0,
+                ahead_us=self.world_model.clocks.ahead_us,
+            ),
+            far_hz=far_hz,
         )
         self.seq = 0
+        self.answers = True
         self.proposes, self.exclusions = False, Exclusions()  # of the peer
         self.acknowledged: Mapping[int, int] = {}  # by the agent, in the newest message that the peer has read
         self.tube_m, self.ahead_us = 0.16, 0  # of the peer: its tube, and its clock, by which it stamps what it hears
         self.heard: dict[int, tuple[int, int]] = {}  # by the peer
+        self.place, self.reach = PLACE, ANYWHERE  # of the peer
         self.blown_m = np.zeros(3)  # off the place where the agent hovers
 
     @property
@@ -94,7 +107,7 @@ class Bench:
     def wanted(self, offsets_s: Array) -> tuple[Array, Array]:
         return np.tile(HERE, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
 
-    def send(self, path_at: Array = PLACE, silent: bool = False) -> None:
+    def send(self, path_at: Array | None = None, silent: bool = False) -> None:
         """The peer is committed to rest at its place, acknowledges, and is at `path_at`."""
         self.seq += 1
         utc_us = self.clock.utc_us()
@@ -104,14 +117,17 @@ class Bench:
             assert message is not None
             self.acknowledged = message.acknowledged
             self.heard = {0: (message.sent_utc_us, utc_us + self.ahead_us)}
-            if message.proposal is not None:
+            if message.proposal is not None and self.answers:
                 acknowledged = {0: message.proposal.number}
         path = builders.predicted_path(
-            seq=self.seq, t0_utc_us=utc_us, dt_us=20_000, pos_ned_m=np.tile(path_at, (41, 1))
+            seq=self.seq,
+            t0_utc_us=utc_us,
+            dt_us=20_000,
+            pos_ned_m=np.tile(self.place if path_at is None else path_at, (41, 1)),
         )
         self.peer.publish(topics.PATH, encode_path(path))
         if not silent:
-            committed = resting(PLACE, utc_us, 100_000)
+            committed = resting(self.place, utc_us, 100_000)
             message = builders.trajectory_message(
                 seq=self.seq,
                 sent_utc_us=utc_us,
@@ -123,7 +139,9 @@ class Bench:
                 acknowledged=acknowledged,
                 exclusions=self.exclusions,
             )
-            self.peer.publish(topics.TRAJECTORY, encode_trajectory_message(message))
+            payload = encode_trajectory_message(replace(message, reach=self.reach))
+            self.peer.publish(topics.FAR_TRAJECTORY, payload)
+            self.peer.publish(topics.TRAJECTORY, payload)
 
     @property
     def committed(self) -> int:
@@ -306,3 +324,63 @@ def test_an_agent_without_a_state_commits_nothing(bench: Bench) -> None:
     assert message is not None
     assert not message.is_committed and message.proposal is None
     assert [name for name, _ in bench.told] == ["commitments"]
+
+
+@pytest.fixture
+def far_bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """The peer rests 30 m away, and has told that the agent is far from it, too."""
+    made = Bench(far_hz=4.0)
+    made.place = np.array([30.0, 0.0, -2.0])
+    made.reach = Reach(far=frozenset({0}), speed_m_s=_SPEED_M_S, stretch_m=_STRETCH_M)
+    monkeypatch.setattr(LocalBus, "alive", lambda self: frozenset(made.alive))
+    return made
+
+
+def committed_unanswered(bench: Bench) -> int:
+    """Return how often the agent commits in a second in which the peer hears it, and acknowledges nothing."""
+    bench.fly(1.0, each=bench.send)
+    before, bench.answers = bench.committed, False
+    bench.fly(1.0, each=bench.send)
+    return bench.committed - before
+
+
+def test_a_far_peer_need_not_acknowledge(far_bench: Bench, bench: Bench) -> None:
+    assert committed_unanswered(far_bench) > 3
+    assert committed_unanswered(bench) == 0
+
+
+def test_a_far_peer_that_falls_silent_has_to_acknowledge_once_the_lease_is_over(far_bench: Bench) -> None:
+    far_bench.fly(1.0, each=far_bench.send)
+    far_bench.fly(1.7)
+    before = far_bench.committed
+    far_bench.fly(3.0)
+    assert far_bench.committed == before
+
+
+@pytest.mark.parametrize("was_far", [True, False])
+def test_an_excluded_peer_matters_only_where_it_may_have_committed_unseen(
+    far_bench: Bench, was_far: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is silent, and a majority has excluded it; the agent is 8 m from it, nearer than it may have come."""
+    far_bench.place = np.array([8.0, 0.0, -2.0])
+    far_bench.reach = replace(far_bench.reach, far=frozenset({0}) if was_far else frozenset())
+    far_bench.fly(1.0, each=far_bench.send)
+    monkeypatch.setattr(far_bench.coordination._membership, "excluded", frozenset({1}))
+    far_bench.fly(2.0)
+    before = far_bench.committed
+    far_bench.fly(1.0)
+    assert (far_bench.committed == before) is was_far
+
+
+def test_the_peer_that_is_far_hears_a_message_in_a_dozen(far_bench: Bench) -> None:
+    heard = far_bench.peer.receive
+    far_bench.fly(1.0, each=far_bench.send)
+    counted = dict.fromkeys((topics.TRAJECTORY, topics.FAR_TRAJECTORY), 0)
+
+    def count() -> None:
+        for topic in counted:
+            counted[topic] += len(heard(topic))
+
+    far_bench.fly(2.0, each=count)
+    assert 6 <= counted[topics.FAR_TRAJECTORY] <= 20
+    assert counted[topics.TRAJECTORY] >= 40

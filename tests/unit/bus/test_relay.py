@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from swarmctl.bus.relay import RelayingBus, decode_relay, encode_relay, missed_b
 from swarmctl.bus.topics import PATH, RELAY, TOO_LONG, TRAJECTORY
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import resting
-from swarmctl.core.trajectory_message import TrajectoryMessage
+from swarmctl.core.trajectory_message import Reach, TrajectoryMessage
 from tests import builders
 
 MESSAGES = [(2, b"second"), (0, b""), (7, bytes(range(256)))]
@@ -117,16 +118,20 @@ def missed(
     lacked_us: int = 1_000_000,
     period_us: int = PERIOD_US,
     ahead_us: int = 0,
+    far_us: int = 0,
+    far: frozenset[int] = frozenset(),
 ) -> list[int]:
     """Return what `own` passes on to agent 1, which says of whom it has `heard`; all but agent 1 have heard agent 2."""
     known = dict.fromkeys((0, 1, 2, *helpers), (NEWEST_US, NOW_US))
     newest = {
-        1: message(1, sent_us=NOW_US + ahead_us, heard=heard),
+        1: replace(message(1, sent_us=NOW_US + ahead_us, heard=heard), reach=Reach(far=far)),
         2: message(2, sent_us=NEWEST_US, heard={1: (NOW_US, NEWEST_US - 10_000)}),
         **{helper: message(helper, sent_us=NEWEST_US, heard=known) for helper in helpers},
     }
-    own_heard = {agent: (said.sent_utc_us, NOW_US) for agent, said in newest.items()} | {1: (NOW_US, received_us)}
-    return missed_by_peers(own, newest, own_heard, NOW_US, period_us=period_us, lacked_us=lambda *_: lacked_us)
+    arrivals_us = dict.fromkeys(newest, NOW_US) | {1: received_us}
+    return missed_by_peers(
+        own, newest, newest, arrivals_us, NOW_US, period_us=period_us, far_us=far_us, lacked_us=lambda *_: lacked_us
+    )
 
 
 @pytest.mark.parametrize(
@@ -165,6 +170,20 @@ def test_who_was_held_up_itself_is_not_missed() -> None:
     assert missed(heard, lacked_us=80_000) == [2], "control: what it lacks was sent long before it said so"
 
 
+def test_who_is_far_is_helped_later_as_it_hears_less() -> None:
+    """Nothing of agent 2, whose messages to all are 250 ms apart, has come for 0.6 s, and for 1.2 s."""
+    half_a_second, longer = ({2: (NOW_US - us, NOW_US - us), 0: (NOW_US, NOW_US)} for us in (600_000, 1_200_000))
+    lacked_us = 2_000_000
+    assert missed(half_a_second, far_us=250_000, far=frozenset({2}), lacked_us=lacked_us) == []
+    assert missed(longer, far_us=250_000, far=frozenset({2}), lacked_us=lacked_us) == [2]
+    assert missed(half_a_second, far_us=250_000, lacked_us=lacked_us) == [2], "control: it is not far"
+
+
+def test_of_whom_a_message_says_nothing_is_not_missed_if_it_is_far() -> None:
+    assert missed({0: (NOW_US, NOW_US)}, far_us=250_000, far=frozenset({2})) == []
+    assert missed({0: (NOW_US, NOW_US)}, far_us=250_000) == [2], "control: it has never been heard"
+
+
 HELPERS = (0, 3, 4, 5, 6)
 
 
@@ -194,7 +213,7 @@ def test_who_helps_differs_from_agent_to_agent() -> None:
     counts = []
     for own in set(agents) - set(lost):
         others = {i: said for i, said in newest.items() if i != own}
-        args = (own, others, dict.fromkeys(others, (NOW_US, NOW_US)), NOW_US)
-        counts.append(len(missed_by_peers(*args, period_us=PERIOD_US, lacked_us=lambda *_: 1_000_000)))
+        args = (own, others, others, dict.fromkeys(others, NOW_US), NOW_US)
+        counts.append(len(missed_by_peers(*args, period_us=PERIOD_US, far_us=0, lacked_us=lambda *_: 1_000_000)))
     assert sum(counts) == 2 * (len(lost) - 1)
     assert max(counts) <= 5

@@ -25,7 +25,7 @@ from swarmctl.bus.senders import Presence
 from swarmctl.control.commit.protocol import acknowledgements
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
-from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
+from swarmctl.core.trajectory_message import Exclusions, Proposal, Reach, TrajectoryMessage
 from tests import builders
 
 UTC_US = 1_700_000_000_000_000
@@ -64,7 +64,7 @@ def test_a_decoded_message_is_what_was_encoded(propose: bool) -> None:
         True,
         sent.acknowledged,
     )
-    assert (decoded.exclusions, decoded.heard) == (sent.exclusions, sent.heard)
+    assert (decoded.exclusions, decoded.heard, decoded.reach) == (sent.exclusions, sent.heard, sent.reach)
     assert decoded.sent_utc_us == UTC_US + 20_000
     assert decoded.tube_m == pytest.approx(0.25)
     np.testing.assert_allclose(decoded.committed.pos_ned_m, sent.committed.pos_ned_m, atol=1e-6)
@@ -73,6 +73,34 @@ def test_a_decoded_message_is_what_was_encoded(propose: bool) -> None:
     if decoded.proposal is not None:
         assert decoded.proposal.order == (UTC_US + 5, 2)
         np.testing.assert_allclose(decoded.proposal.trajectory.vel_ned_m_s, trajectory(0.5).vel_ned_m_s, atol=1e-6)
+
+
+@pytest.mark.parametrize("asks_far", [True, False])
+def test_what_those_that_are_far_count_on_is_encoded(asks_far: bool) -> None:
+    reach = Reach(far=frozenset({3, 250}), speed_m_s=2.25, stretch_m=6.5)
+    sent = message()
+    assert sent.proposal is not None
+    sent = replace(sent, reach=reach, proposal=replace(sent.proposal, asks_far=asks_far))
+    decoded = decode_trajectory_message(encode_trajectory_message(sent))
+    assert decoded is not None and decoded.proposal is not None
+    assert (decoded.reach, decoded.proposal.asks_far) == (reach, asks_far)
+
+
+@pytest.mark.parametrize(("speed_m_s", "stretch_m"), [(math.nan, 1.0), (1.0, math.nan), (-1.0, 1.0), (1.0, -math.inf)])
+def test_bounds_that_bound_nothing_are_refused(speed_m_s: float, stretch_m: float) -> None:
+    sent = replace(message(), reach=Reach(speed_m_s=speed_m_s, stretch_m=stretch_m))
+    assert decode_trajectory_message(encode_trajectory_message(sent)) is None
+
+
+def test_what_was_heard_is_found_whatever_the_numbers_are() -> None:
+    """Bytes of stamps look like numbers of agents."""
+    heard = {agent: (agent << 32 | 7, 9 << 32 | agent) for agent in (0, 1, 7, 9, 200)}
+    decoded = decode_trajectory_message(encode_trajectory_message(replace(message(), heard=heard)))
+    assert decoded is not None
+    assert {agent: decoded.heard.get(agent) for agent in range(256)} == {
+        agent: heard.get(agent) for agent in range(256)
+    }
+    assert dict(decoded.heard) == heard and len(decoded.heard) == len(heard)
 
 
 def test_truncated_lengthened_and_mutilated_messages_are_refused() -> None:
@@ -93,14 +121,15 @@ def flat(points: int) -> Trajectory:
     return Trajectory(t0_utc_us=UTC_US, dt_us=100_000, pos_ned_m=zeros, vel_ned_m_s=zeros)
 
 
-FLAGS, TUBE, STEP, POINTS = 3, 24, 44, 52  # offsets: of the header's flags and tube, of the committed step and points
+FLAGS, TUBE, STEP, POINTS = 3, 24, 54, 62  # offsets: of the header's flags and tube, of the committed step and points
 
 
 @pytest.mark.parametrize(
     ("offset", "code", "value", "fits"),
     [
         (FLAGS, "<B", 3, True),
-        (FLAGS, "<B", 7, False),
+        (FLAGS, "<B", 7, True),
+        (FLAGS, "<B", 8, False),
         (TUBE, "<f", 0.0, True),
         (TUBE, "<f", 100.0, True),
         *((TUBE, "<f", bad, False) for bad in (-0.1, 101.0, math.nan, math.inf)),

@@ -1,0 +1,96 @@
+"""Commitments in a swarm wider than its vehicles reach: who is far need not acknowledge, and nobody is met unseen."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from swarmctl.agent.sharing.interest import Interest
+from swarmctl.bus import topics
+from swarmctl.control.commit.reach import FarPeers
+from tests.closed_loop.conftest import Flight, fly_now, mission_t_s
+from tests.closed_loop.test_interest import to_goals
+
+COMMITTED_M = 0.85
+FAR = (
+    "separation.mode=guaranteed",
+    "agent.path_sharing.far_hz=4",
+    "agent.path_sharing.speed_m_s=2.2",
+    "mission.goto.accel_m_s2=1",
+)
+_STARTS = [[0.0, -14.0, -3.0], [0.0, 14.0, -3.0]]
+_FARTHER = [[0.0, -16.0, -3.0], [0.0, 16.0, -3.0]]
+
+
+@pytest.fixture
+def by_commitments_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let nobody plan around the predicted paths of others, which would keep them apart, too."""
+    monkeypatch.setattr(Interest, "_reaches", lambda *_, **__: False)
+
+
+def head_on(*more: str) -> Flight:
+    """Fly two agents towards each other, each to the start of the other one, from where neither reaches the other."""
+    return to_goals(_STARTS, _STARTS[::-1], *FAR, *more)
+
+
+def sent(flight: Flight) -> dict[str, int]:
+    """Return the messages that both have sent, by topic."""
+    totals = [agent.sent for agent in flight.lockstep.agents if agent is not None]
+    return {name: sum(total.get(name, {}).get("messages", 0) for total in totals) for name in totals[0]}
+
+
+@pytest.mark.usefixtures("by_commitments_alone")
+def test_two_that_come_from_far_acknowledge_each_other_before_they_can_meet() -> None:
+    flight = head_on()
+    assert flight.separation_m() >= COMMITTED_M
+
+
+@pytest.mark.usefixtures("by_commitments_alone")
+def test_negative_control_who_is_taken_for_far_for_ever_is_flown_into(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FarPeers, "_radius_m", lambda *_: -1.0)
+    assert head_on().separation_m() < 0.5
+
+
+def test_who_is_far_is_sent_a_twelfth_of_the_messages() -> None:
+    """Two pairs, 40 m from each other, swap: 4 messages a second go to all, and about 30 to the one that is near."""
+    starts = [[x, y, -3.0] for x in (0.0, 40.0) for y in (-3.0, 3.0)]
+    goals = [starts[i] for i in (1, 0, 3, 2)]
+    flight = to_goals(starts, goals, *FAR)
+    assert flight.separation_m() >= COMMITTED_M
+    messages = sent(flight)
+    assert messages[topics.FAR_TRAJECTORY.name] < 0.25 * messages[topics.TRAJECTORY.name]
+
+
+def test_faster_proposals_take_the_acknowledgements_of_all() -> None:
+    """Everybody counts on 0.5 m/s, and they fly at four times that: all ask all, and get there nevertheless."""
+    flight = head_on("agent.path_sharing.speed_m_s=0.5")
+    assert flight.separation_m() >= COMMITTED_M
+
+
+def in_the_dark() -> Flight:
+    """Let the bus fail for 14 s, 6 s after both have begun to fly towards each other; they would meet 9 s later."""
+    return fly_now(
+        *("sitl.start=air", "swarm.agents=2", f"start.positions_ned_m={json.dumps(_FARTHER)}", *FAR),
+        *("mission.kind=goto", f"mission.goto.goals_ned_m={json.dumps(_FARTHER[::-1])}", "mission.duration_s=40"),
+        at={6.0: lambda lockstep: lockstep.hub.fail(), 20.0: lambda lockstep: lockstep.hub.recover()},
+        until=lambda lockstep: mission_t_s(lockstep) > 24.0,
+    )
+
+
+@pytest.mark.usefixtures("by_commitments_alone")
+def test_without_a_bus_even_those_that_are_far_stop() -> None:
+    """Each flies on for the rest of its lease and the final braking, and again once it hears the other."""
+    flight = in_the_dark()
+    assert flight.separation_m() >= COMMITTED_M
+    ticks = flight.ticks(0)
+    stands = (ticks["mission_t_s"] > 12.0) & (ticks["mission_t_s"] < 20.0)
+    assert np.linalg.norm(ticks["vel_ned_m_s"][stands], axis=1).max() < 0.1
+    assert np.linalg.norm(ticks["vel_ned_m_s"][ticks["mission_t_s"] > 22.0], axis=1).max() > 0.5
+
+
+@pytest.mark.usefixtures("by_commitments_alone")
+def test_negative_control_without_the_lease_they_fly_into_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FarPeers, "_is_leased", lambda self, agent, *_: agent not in self.near)
+    assert in_the_dark().separation_m() < 0.5
