@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from swarmctl.bus.bus import Bus, ForwardingBus, agent_name
 from swarmctl.bus.messages.commitment_messages import HeardTimes
@@ -137,16 +137,17 @@ def missed_by_peers(
     for peer, message in telling.items():
         if utc_us - received_us[peer] > (period_us if far_us else _HELPED_US) or message is not newest[peer]:
             continue  # where not every message says what was heard, each is looked at once
-        has_heard_all = len(message.heard) >= len(newest) - len(message.reach.far)
-        if far_us and has_heard_all and _heard_lately(message, rare_us if own in message.reach.far else near_us):
+        far = message.reach.far
+        has_heard_all = len(message.heard) >= len(newest) - len(far)
+        if far_us and has_heard_all and _heard_lately(message, rare_us if own in far else near_us):
             continue
         heard = dict(message.heard.items())
-        for agent in _mentioned(message, newest):
+        for agent in newest.keys() - (far - heard.keys()) if far else newest:  # of far ones, those it mentions
             other, (stamp_us, arrival_us) = newest[agent], heard.get(agent, _NEVER)
             silent_us = message.sent_utc_us - arrival_us
             if silent_us <= near_us or other.sent_utc_us <= stamp_us or agent == peer or agent in found:
                 continue
-            is_rare = agent in message.reach.far or peer in other.reach.far or not other.is_committed
+            is_rare = agent in far or peer in other.reach.far or not other.is_committed
             least_us = rare_us if is_rare else near_us
             waited_us = min(silent_us, lacked_us(message, agent, stamp_us) + period_us)
             if waited_us <= least_us:
@@ -161,12 +162,6 @@ def _heard_lately(message: TrajectoryMessage, least_us: int) -> bool:
     heard = message.heard
     oldest_us = heard.oldest_us if isinstance(heard, HeardTimes) else min(arrival for _, arrival in heard.values())
     return message.sent_utc_us - oldest_us <= least_us
-
-
-def _mentioned(message: TrajectoryMessage, newest: Mapping[int, TrajectoryMessage]) -> Collection[int]:
-    """Return the agents of which a message says when they were heard, or, of those that are not far, that never."""
-    far = message.reach.far
-    return newest.keys() - (far - message.heard.keys()) if far else newest.keys()
 
 
 def _rank(own: int, peer: int, agent: int, telling: Mapping[int, TrajectoryMessage], least_us: int) -> int:

@@ -126,6 +126,13 @@ def test_refused_in_one_line_with_key_value_and_what_is_allowed(
     assert "\n" not in text
 
 
+def test_those_that_commit_are_heard_often_enough_to_do_without_acknowledgements(tmp_path: Path) -> None:
+    commits, path = "separation.mode=guaranteed", file_with(tmp_path, "")
+    (problem,) = refusals(path, commits, "agent.path_sharing.far_hz=1.9")
+    assert "2 to 25" in problem and "acknowledge everything" in problem
+    assert load(path, (commits, "agent.path_sharing.far_hz=2")).separation.mode == "guaranteed"
+
+
 def test_a_vector_is_reported_once_and_a_missing_file_as_itself(tmp_path: Path) -> None:
     assert len(refusals(None, "mission.goto.goals_ned_m=[[5.0]]")) == 1
     (missing,) = refusals(tmp_path / "none.toml")

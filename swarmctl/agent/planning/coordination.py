@@ -54,9 +54,8 @@ class Coordination:
             and `commitments` with all counts when the autopilot or a pilot takes over.
 
     Attributes:
-        committed_peers: by agent number, the trajectories that each peer within reach may follow, if it is relied on.
-            A silent peer is relied
-            on as well: it rests where its last commitment ends, also when a majority has excluded it.
+        committed_peers: by agent number, the trajectories that each peer within reach may follow, if it is relied on. A
+            silent peer is, too: it rests where its last commitment ends, also when a majority has excluded it.
         lost_peer_keep_outs: keep-outs at the ends of lost peers' committed trajectories.
         cut_off: why the agent has to land where it is: it waits for peers in vain, or they have excluded it; or "".
         alert: what keeps it from committing to anything new, or nearly; or "".
@@ -177,8 +176,7 @@ class Coordination:
         self._watch(utc_us, since_us, state)
         required, newest = self._required_peers(), self._peer_trajectories.newest
         known = self._near_messages()
-        self._spare(utc_us)
-        asked, near = required - self._spared, self._far_peers.near
+        asked, near = required - self._still_spared(utc_us), self._far_peers.near
         self.cut_off = self._why_cut_off(utc_us, asked & near if commitments.proposal is None else asked)
         if commitments.proposal is not None:
             commitments.update(utc_us, {a: i for a, i in newest.items() if a not in self._spared}, asked)
@@ -219,9 +217,10 @@ class Coordination:
 
     def _still_spared(self, utc_us: int) -> frozenset[int]:
         """Return the peers whose acknowledgement of the proposal is not required, by what they have said since."""
-        proposal = self._commitments.proposal
-        if proposal is not None and self._spared:
-            newest = self._peer_trajectories.newest
+        proposal, newest = self._commitments.proposal, self._peer_trajectories.newest
+        if proposal is None:
+            self._spared = frozenset()
+        elif self._spared:
             self._spared = self._far_peers.still_spared(self._spared, proposal.trajectory, newest, utc_us)
             self._ask_far(proposal)
         return self._spared
