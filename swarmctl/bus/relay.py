@@ -160,7 +160,7 @@ def missed_by_peers(
 def _heard_lately(message: TrajectoryMessage, least_us: int) -> bool:
     """Return whether the sender of a message has heard everybody it mentions within a while."""
     heard = message.heard
-    oldest_us = heard.oldest_us if isinstance(heard, HeardTimes) else min(arrival for _, arrival in heard.values())
+    oldest_us = heard.oldest_us if isinstance(heard, HeardTimes) else min((at for _, at in heard.values()), default=0)
     return message.sent_utc_us - oldest_us <= least_us
 
 
