@@ -21,6 +21,11 @@ class Topic:
     reliable: bool
     repeats: str = ""  # topic whose messages it carries, too: to seals and relays the two are one
 
+    @property
+    def stream(self) -> str:
+        """Return the name under which messages are sealed."""
+        return self.repeats or self.name
+
 
 PATH = Topic(name="path", ring=8, max_bytes=4096, reliable=False)
 FAR_PATH = Topic(name="far_path", ring=8, max_bytes=4096, reliable=False)  # the paths that peers out of reach hear too

@@ -53,7 +53,7 @@ def test_negative_control_who_is_taken_for_far_for_ever_is_flown_into(monkeypatc
     assert head_on().separation_m() < 0.5
 
 
-def test_who_is_far_is_sent_a_twelfth_of_the_messages() -> None:
+def test_who_is_far_is_sent_less_than_a_quarter_of_the_messages() -> None:
     """Two pairs, 40 m from each other, swap: 4 messages a second go to all, and about 30 to the one that is near."""
     starts = [[x, y, -3.0] for x in (0.0, 40.0) for y in (-3.0, 3.0)]
     goals = [starts[i] for i in (1, 0, 3, 2)]

@@ -50,7 +50,7 @@ class CommitmentPublisher:
         self._period_us = round(1e6 / rate_hz)
         self._far_us = round(1e6 / far_hz) if far_hz else 0
         self._seq, self._due_us, self._sent_us, self._heard_us = 0, 0, 0, 0
-        self._half = 0  # of those that are far, by number, whose messages were acknowledged last
+        self._half = 0  # of those that are far, by number, which the last message to all has mentioned
         self._news: tuple[object, ...] = (None, None)  # what the last message said that those who hear all wait for
         self._told_reach, self._told_exclusions = _NOWHERE, Exclusions()  # as all know
         self._asked = 0  # number of the newest proposal that all have been asked to acknowledge

@@ -129,9 +129,7 @@ class Coordination:
     def _attend(self, utc_us: int) -> None:
         """Hear every message of the peers that are not far, and of those to which this agent is not."""
         own, newest = self._commitments.trajectories, self._peer_trajectories.newest
-        if not self._far_peers.enabled or not own:
-            return
-        if not self._far_peers.update(own, newest, utc_us):
+        if not own or not self._far_peers.update(own, newest, utc_us):
             return
         hears = self._far_peers.near | {agent for agent, i in newest.items() if self._agent not in i.reach.far}
         if hears != self._hears:
@@ -211,7 +209,7 @@ class Coordination:
         """Choose the peers whose acknowledgement of a new proposal is not required."""
         proposal, peers = self._commitments.proposal, self._peer_trajectories
         self._spared = frozenset()
-        if proposal is not None and self._far_peers.enabled:
+        if proposal is not None:
             self._spared = self._far_peers.spared(proposal.trajectory, peers.newest, peers.confirmed_us, utc_us)
             self._ask_far(proposal)
 
@@ -339,11 +337,9 @@ class Coordination:
 
         One that was excluded while this agent was far from it may have committed to something unseen.
         """
-        excluded = self._membership.excluded
-        if excluded and self._far_peers.enabled:
-            newest = self._peer_trajectories.newest
-            excluded = frozenset(a for a in excluded if a not in newest or self._agent not in newest[a].reach.far)
-        participants = self._peers - excluded - self._ended
+        newest, excluded = self._peer_trajectories.newest, self._membership.excluded
+        unseen = {agent for agent in excluded & newest.keys() if self._agent in newest[agent].reach.far}
+        participants = self._peers - (excluded - unseen) - self._ended
         return frozenset(agent for agent in participants if self._world_model.uses_commitments(agent))
 
     def _absent(self) -> set[int]:

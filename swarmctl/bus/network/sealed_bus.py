@@ -38,14 +38,14 @@ class SealedBus(ForwardingBus):
 
     def publish(self, topic: Topic, payload: bytes) -> None:
         """Seal and send to all subscribers."""
-        self._bus.publish(topic, self._sealer.seal(topic.repeats or topic.name, payload, self._utc_us()))
+        self._bus.publish(topic, self._sealer.seal(topic.stream, payload, self._utc_us()))
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
         """Return what others have said since the last call; one that is too long is delivered as such."""
         arrived = self._bus.receive(topic)
         if not arrived:
             return arrived
-        utc_us, opened, stream = self._utc_us(), list[tuple[str, bytes]](), topic.repeats or topic.name
+        utc_us, opened, stream = self._utc_us(), list[tuple[str, bytes]](), topic.stream
         for sender, sealed in arrived:
             if sealed == TOO_LONG:
                 opened.append((sender, sealed))

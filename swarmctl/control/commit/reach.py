@@ -18,7 +18,7 @@ acknowledgement of B and B without that of A, and let A have been the later one 
 B. From its place in m to where it proposed b, B has come along trajectories that it was committed to or proposed in m,
 or has committed to since. Of the latter, those that A has acknowledged were proposed in m at the latest, as A knows
 nothing newer. For the others, and for b, B did without A, by condition 1 for `LEASE_US` after m at most. Along all of
-them it was no faster than the v_B of m states, and b is no longer than its L_B. So b lies in the ball, and a outside.
+them it was no faster than the v_B that m states, and b is no longer than its L_B. So b lies in the ball, and a outside.
 
 An excluded peer owes nothing as long as its newest message known does not declare the agent far: it commits to nothing
 without the agent then. Otherwise proposals keep clear of its ball, which has ceased to grow.
