@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from itertools import takewhile
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.messages.commitment_messages import Memory, decode_trajectory_message
@@ -92,7 +93,7 @@ class PeerTrajectories:
             agent: the peer, whose newest message is later than the stamp.
             stamp_us: of the newest message of the peer that the sender has heard.
         """
-        first_us = next(stamp for stamp in self._stamps_us[agent] if stamp > stamp_us)
+        *_, first_us = takewhile(lambda stamp: stamp > stamp_us, reversed(self._stamps_us[agent]))
         said_us = message.sent_utc_us - self._clocks.ahead_us(message.agent)
         return said_us - (first_us - self._clocks.ahead_us(agent))
 

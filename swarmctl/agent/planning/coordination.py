@@ -153,6 +153,8 @@ class Coordination:
         messages = self._peer_trajectories.newest.values()
         if self._begun_us is None and not any(message.is_committed for message in messages):
             return set()
+        if utc_us - min(self._peer_trajectories.received_utc_us.values(), default=utc_us) <= _SUSPECT_US:
+            return set()  # as nearly always
         return {agent for agent in self._peers - self._ended if self._silence_us(agent, utc_us) > _SUSPECT_US}
 
     def step(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import ItemsView, Iterator, Mapping
+from functools import lru_cache
 
 import numpy as np
 
@@ -136,13 +137,12 @@ def decode_trajectory_message(
                 asks_far=bool(flags & _ASKS_FAR),
             )
         heard_at = at + acknowledgements * _ACKNOWLEDGEMENT.size
-        agents_at = heard_at + heard * _HEARD.size
-        if len(payload) != agents_at + (suspected + promised + far) * _AGENT.size:
+        suspected_at = heard_at + heard * _HEARD.size
+        promised_at = suspected_at + suspected * _AGENT.size
+        far_at = promised_at + promised * _AGENT.size
+        if len(payload) != far_at + far * _AGENT.size:
             return None
         acknowledged = dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:heard_at]))
-        agents = [number for (number,) in _AGENT.iter_unpack(payload[agents_at:])]
-        far_at = suspected + promised
-        exclusions = Exclusions(suspected=frozenset(agents[:suspected]), promised=frozenset(agents[suspected:far_at]))
         if memory is not None:
             memory.clear()
             memory.update(sent)
@@ -156,12 +156,20 @@ def decode_trajectory_message(
             tube_m=tube_m,
             proposal=proposal,
             acknowledged=acknowledged,
-            exclusions=exclusions,
-            heard=HeardTimes(payload[heard_at:agents_at]),
-            reach=Reach(far=frozenset(agents[far_at:]), speed_m_s=speed_m_s, stretch_m=stretch_m),
+            exclusions=Exclusions(
+                suspected=_agents(payload[suspected_at:promised_at]), promised=_agents(payload[promised_at:far_at])
+            ),
+            heard=HeardTimes(payload[heard_at:suspected_at]),
+            reach=Reach(far=_agents(payload[far_at:]), speed_m_s=speed_m_s, stretch_m=stretch_m),
         )
     except (struct.error, ValueError):
         return None
+
+
+@lru_cache(maxsize=1024)
+def _agents(encoded: bytes) -> frozenset[int]:
+    """Return the numbers of a list; most lists are those of the message before."""
+    return frozenset(agent for (agent,) in _AGENT.iter_unpack(encoded))
 
 
 def _flags(message: TrajectoryMessage) -> int:

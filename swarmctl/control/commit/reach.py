@@ -31,7 +31,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import ANYWHERE, Reach, TrajectoryMessage
@@ -107,17 +106,9 @@ class FarPeers:
             return False
         self._looked_us = utc_us
         known = [agent for agent in self._peers if agent in messages]
-        places = [self._place(agent, messages[agent]) for agent in known]
-        near = self._peers.difference(known)
-        if places:
-            kept_m = [
-                self._apart_m + self._radius_m(place, utc_us) + (_LEAVING_M if agent in self.near else _COMING_M)
-                for agent, place in zip(known, places, strict=True)
-            ]
-            points = np.concatenate([trajectory.pos_ned_m[::_EVERY] for trajectory in own] + [own[0].pos_ned_m[-1:]])
-            clear = _are_clear(points, places, np.array(kept_m)).tolist()
-            near = near.union(agent for agent, is_clear in zip(known, clear, strict=True) if not is_clear)
-        self.near = near
+        points = np.concatenate([trajectory.pos_ned_m[::_EVERY] for trajectory in own] + [own[0].pos_ned_m[-1:]])
+        room_m = [_LEAVING_M if agent in self.near else _COMING_M for agent in known]
+        self.near = self._peers - self._clear(known, points, messages, utc_us, room_m)
         return True
 
     def spared(
@@ -138,7 +129,7 @@ class FarPeers:
         if not self.enabled or not self._is_within(self._extent(trajectory)):
             return _NOBODY
         leased = [agent for agent in self._told if self._is_leased(agent, confirmed_us.get(agent, 0), utc_us)]
-        return self._clear_of(leased, trajectory, messages, utc_us)
+        return self._checked_clear(leased, trajectory, messages, utc_us)
 
     def still_spared(
         self, spared: frozenset[int], trajectory: Trajectory, messages: Mapping[int, TrajectoryMessage], utc_us: int
@@ -150,19 +141,31 @@ class FarPeers:
         changed = [agent for agent in spared if messages[agent] is not self._checked[agent]]
         if not changed:
             return spared
-        return spared.difference(changed) | self._clear_of(changed, trajectory, messages, utc_us)
+        return spared.difference(changed) | self._checked_clear(changed, trajectory, messages, utc_us)
 
-    def _clear_of(
+    def _checked_clear(
         self, agents: Sequence[int], trajectory: Trajectory, messages: Mapping[int, TrajectoryMessage], utc_us: int
     ) -> frozenset[int]:
-        """Return the agents whose ball the trajectory keeps clear of."""
+        """Return the agents whose ball the trajectory keeps clear of, and remember by which messages."""
+        self._checked.update((agent, messages[agent]) for agent in agents)
+        return self._clear(agents, trajectory.pos_ned_m, messages, utc_us, [0.0] * len(agents))
+
+    def _clear(
+        self,
+        agents: Sequence[int],
+        points: Array,
+        messages: Mapping[int, TrajectoryMessage],
+        utc_us: int,
+        room_m: Sequence[float],
+    ) -> frozenset[int]:
+        """Return the agents whose ball, larger by the room for each, all points (K, 3) are outside of."""
         if not agents:
             return _NOBODY
         places = [self._place(agent, messages[agent]) for agent in agents]
-        self._checked.update((agent, messages[agent]) for agent in agents)
-        kept_m = np.array([self._apart_m + self._radius_m(place, utc_us) for place in places])
-        clear = _are_clear(trajectory.pos_ned_m, places, kept_m).tolist()
-        return frozenset(agent for agent, is_clear in zip(agents, clear, strict=True) if is_clear)
+        kept_m = self._apart_m + np.array([self._radius_m(place, utc_us) for place in places]) + np.array(room_m)
+        ways = points[None] - np.array([place.pos_ned_m for place in places])[:, None]  # (N, K, 3)
+        are_clear = np.einsum("akc,akc->ak", ways, ways).min(axis=1) > kept_m * kept_m
+        return frozenset(agent for agent, is_clear in zip(agents, are_clear.tolist(), strict=True) if is_clear)
 
     def reach(self, own: Collection[Trajectory], *, away_m: float, speed_m_s: float) -> Reach:
         """Return what a message states.
@@ -215,12 +218,6 @@ class FarPeers:
         error_us, reach = place.message.committed.clock_error_us, place.message.reach
         ahead_us = min(max(0, utc_us - place.sent_utc_us) + error_us, LEASE_US) + error_us
         return reach.speed_m_s * 1e-6 * ahead_us + reach.stretch_m + place.message.tube_m
-
-
-def _are_clear(points: Array, places: Sequence[_Place], kept_m: Array) -> NDArray[np.bool_]:
-    """Return (N,), for each place, whether all points (K, 3) are farther from it than `kept_m` (N,)."""
-    ways = points[None] - np.array([place.pos_ned_m for place in places])[:, None]
-    return np.asarray(np.einsum("akc,akc->ak", ways, ways).min(axis=1) > kept_m * kept_m)
 
 
 def _extent_of(trajectory: Trajectory) -> _Extent:
