@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from swarmctl.agent.planning.commitment_publisher import CommitmentPublisher
 from swarmctl.agent.sharing.interest import Interest
 from swarmctl.bus import topics
 from swarmctl.control.commit.reach import FarPeers
@@ -53,14 +54,24 @@ def test_negative_control_who_is_taken_for_far_for_ever_is_flown_into(monkeypatc
     assert head_on().separation_m() < 0.5
 
 
-def test_who_is_far_is_sent_less_than_a_quarter_of_the_messages() -> None:
-    """Two pairs, 40 m from each other, swap: 4 messages a second go to all, and about 30 to the one that is near."""
+def share_for_all_01() -> float:
+    """Swap two pairs, 40 m from each other; return the share of messages that go to all, not to the near one alone."""
     starts = [[x, y, -3.0] for x in (0.0, 40.0) for y in (-3.0, 3.0)]
     goals = [starts[i] for i in (1, 0, 3, 2)]
     flight = to_goals(starts, goals, *FAR)
     assert flight.separation_m() >= COMMITTED_M
     messages = sent(flight)
-    assert messages[topics.FAR_TRAJECTORY.name] < 0.25 * messages[topics.TRAJECTORY.name]
+    return messages[topics.FAR_TRAJECTORY.name] / messages[topics.TRAJECTORY.name]
+
+
+def test_who_is_far_is_sent_less_than_a_quarter_of_the_messages() -> None:
+    """4 messages a second go to all, and about 30 to the one that is near."""
+    assert share_for_all_01() < 0.25
+
+
+def test_negative_control_with_every_message_for_all_it_is_sent_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(CommitmentPublisher, "_is_for_all", lambda *_: True)
+    assert share_for_all_01() > 0.9
 
 
 def test_faster_proposals_take_the_acknowledgements_of_all() -> None:
