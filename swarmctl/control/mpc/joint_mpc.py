@@ -29,6 +29,7 @@ from swarmctl.core.types import Array, Plan
 # Factor on the solver's tolerance. Increments of z are ten times larger and set the scale of the cost, by which OSQP
 # measures dual residuals: with 0.1 x-y never comes to rest (0.44 m/s about its goal for ever), with 0.01 within 8 mm.
 _TOLERANCE_01 = 0.01
+_GRAVITY_NED_M_S2 = np.array([0.0, 0.0, GRAVITY_M_S2])
 _MIN_THRUST_M_S2 = 1.0  # without thrust, tilt would have no effect in the model
 
 
@@ -91,19 +92,17 @@ class JointMpc:
         return
 
     def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
-        start, steps = problem.start, self.steps
-        held = max(_MIN_THRUST_M_S2, float(start.virtual_control[2]))
-        first = self._solve(problem, np.full(steps, held), spaces)
-        found = self._solve(problem, first.u[:, 2], spaces)
+        start, steps, ahead = problem.start, self.steps, self._mpc.prediction
+        acting = _joined(start.tilt, start.virtual_control[2]), _joined(start.tilt_rate_1_s, 0.0)
+        drift_m_s2 = problem.disturbance_ned_m_s2 + _GRAVITY_NED_M_S2
+        solve = partial(self._solve, problem, spaces, acting, drift_m_s2)
+        first = solve(np.full(steps, max(_MIN_THRUST_M_S2, float(start.virtual_control[2]))))
+        found = solve(first.u[:, 2])
         found = replace(found, solve_us=first.solve_us + found.solve_us, iterations=first.iterations + found.iterations)
-        thrust = found.u[:, 2:]
-        tilt, rate = self._acting(problem)
-        ahead = self._mpc.prediction
-        acting = ahead.realised(found.u, tilt, rate)
-        along = np.column_stack([acting[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
+        along = _joined(ahead.realised(found.u, *acting)[:, :2], start.cos_tilt)  # (steps, 3)
         motion = np.empty((2, steps + 1, 3))
         motion[0, 0], motion[1, 0] = start.pos_ned_m, start.vel_ned_m_s
-        motion[:, 1:] = ahead.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
+        motion[:, 1:] = ahead.motion(start.pos_ned_m, start.vel_ned_m_s, drift_m_s2 - found.u[:, 2:] * along)
         first_row, stopwatch_ns = ahead.first_row(), self._stopwatch_ns
         return judged(
             problem,
@@ -119,15 +118,32 @@ class JointMpc:
             volume=self._volume,
         )
 
-    def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:
+    def _solve(
+        self,
+        problem: Problem,
+        spaces: HalfSpaces | None,
+        acting: tuple[Array, Array],
+        drift_m_s2: Array,
+        thrust_m_s2: Array,
+    ) -> AxesSolution:
+        """Solve with the lever of the tilt that a thrust gives.
+
+        Args:
+            problem, spaces: of this step.
+            acting: inputs (3,) realised at the start, and their rates (3,).
+            drift_m_s2: acceleration (3,) NED without thrust.
+            thrust_m_s2: (steps,).
+        """
         steps, start, reference = self.steps, problem.start, problem.reference
-        realised, realised_1_s = self._acting(problem)
+        realised, realised_1_s = acting
+        gain_m_s2 = np.empty((steps, 3))
+        gain_m_s2[:, :2], gain_m_s2[:, 2] = -thrust_m_s2[:, None], -start.cos_tilt
         asked = AxesProblem(
             pos_m=start.pos_ned_m,
             vel_m_s=start.vel_ned_m_s,
             u_prev=start.virtual_control,
-            gain_m_s2=np.column_stack([-thrust_m_s2, -thrust_m_s2, np.full(steps, -start.cos_tilt)]),
-            drift_m_s2=self._drift(problem),
+            gain_m_s2=gain_m_s2,
+            drift_m_s2=drift_m_s2,
             ref_pos_m=reference.pos_ned_m[1 : steps + 1],
             ref_vel_m_s=reference.vel_ned_m_s[1 : steps + 1],
             realised=realised,
@@ -135,13 +151,9 @@ class JointMpc:
         )
         return self._mpc.solve(asked, spaces)
 
-    @staticmethod
-    def _acting(problem: Problem) -> tuple[Array, Array]:
-        """Return the realised inputs (3,) at the start, and their rates (3,)."""
-        start = problem.start
-        return np.append(start.tilt, start.virtual_control[2]), np.append(start.tilt_rate_1_s, 0.0)
 
-    @staticmethod
-    def _drift(problem: Problem) -> Array:
-        """Return the acceleration (3,) NED [m/s2] without thrust."""
-        return np.asarray(problem.disturbance_ned_m_s2 + np.array([0.0, 0.0, GRAVITY_M_S2]))
+def _joined(xy: Array, z: float) -> Array:
+    """Return (..., 3) of x and y (..., 2), and the same z for all; `np.append` takes longer."""
+    found = np.empty((*xy.shape[:-1], 3))
+    found[..., :2], found[..., 2] = xy, z
+    return found

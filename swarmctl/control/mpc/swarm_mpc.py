@@ -329,9 +329,10 @@ def planned(
     began_ns = stopwatch_ns()
     spaces = spaces_of(separation)
     best = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
-    for relaxed in _relaxed(separation):
-        if spaces is None or best.status is not PlanStatus.NOT_CERTIFIED:
-            return best
+    others = _relaxed(separation)
+    while (
+        spaces is not None and best.status is PlanStatus.NOT_CERTIFIED and (relaxed := next(others, None)) is not None
+    ):
         began_ns, before, spaces = stopwatch_ns(), spaces, spaces_of(relaxed)
         if spaces is not None and not _are_equal(spaces, before):
             found = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
