@@ -93,7 +93,8 @@ class PeerTrajectories:
             agent: the peer, whose newest message is later than the stamp.
             stamp_us: of the newest message of the peer that the sender has heard.
         """
-        *_, first_us = takewhile(lambda stamp: stamp > stamp_us, reversed(self._stamps_us[agent]))
+        later_us = takewhile(lambda stamp: stamp > stamp_us, reversed(self._stamps_us[agent]))  # the newest first
+        *_, first_us = later_us
         said_us = message.sent_utc_us - self._clocks.ahead_us(message.agent)
         return said_us - (first_us - self._clocks.ahead_us(agent))
 

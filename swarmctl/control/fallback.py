@@ -6,7 +6,7 @@ import numpy as np
 
 from swarmctl.control.lag import Lag
 from swarmctl.control.mpc.problem import Start
-from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.frames import GRAVITY_NED_M_S2
 from swarmctl.core.types import Array, Plan, PlanStatus
 
 _DAMPING_1_S = 4.0
@@ -35,9 +35,7 @@ def brake_and_hold_plan(
         if at_ned_m is not None:
             wanted = wanted + stiffness * (at_ned_m - pos[k])
         accel = np.clip(wanted, -_ACCEL_MAX_M_S2, _ACCEL_MAX_M_S2)
-        thrust_vector = (
-            np.array([0.0, 0.0, GRAVITY_M_S2]) + disturbance_ned_m_s2 - accel
-        )  # thrust vector over mass, up positive
+        thrust_vector = GRAVITY_NED_M_S2 + disturbance_ned_m_s2 - accel  # thrust vector over mass, up positive
         slew = _TILT_RATE_1_S * dt_s
         u = np.clip(
             thrust_vector[:2] / float(np.sqrt(thrust_vector @ thrust_vector)), commanded - slew, commanded + slew

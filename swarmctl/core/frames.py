@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 GRAVITY_M_S2 = 9.81
+GRAVITY_NED_M_S2 = np.array([0.0, 0.0, GRAVITY_M_S2])
+GRAVITY_NED_M_S2.flags.writeable = False
 
 Array = NDArray[np.float64]
 

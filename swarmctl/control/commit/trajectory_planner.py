@@ -20,7 +20,7 @@ from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 from swarmctl.control.reference.approach import approached
 from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.flight_volume import FlightVolume
-from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.frames import GRAVITY_NED_M_S2
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, positions_at, stopping
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 
@@ -217,7 +217,7 @@ class TrajectoryPlanner:
         """Return the virtual controls (3,) that fly the committed trajectory when the plan begins."""
         vel = committed.sample(np.array([now.begin_us]))[1][0]
         pushed = now.disturbance_ned_m_s2 - self._drag_1_s * vel
-        thrust = np.array([0.0, 0.0, GRAVITY_M_S2]) + pushed - committed.acceleration(now.begin_us)
+        thrust = GRAVITY_NED_M_S2 + pushed - committed.acceleration(now.begin_us)
         size = float(np.sqrt(thrust @ thrust))
         return np.array([thrust[0] / size, thrust[1] / size, size])
 

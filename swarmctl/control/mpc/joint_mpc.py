@@ -23,13 +23,12 @@ from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.sized_mpc import SizedMpc
 from swarmctl.control.mpc.swarm_mpc import MpcParams, faces_along, first_guess, near_half_spaces, planned
 from swarmctl.core.flight_volume import FlightVolume
-from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.frames import GRAVITY_NED_M_S2
 from swarmctl.core.types import Array, Plan
 
 # Factor on the solver's tolerance. Increments of z are ten times larger and set the scale of the cost, by which OSQP
 # measures dual residuals: with 0.1 x-y never comes to rest (0.44 m/s about its goal for ever), with 0.01 within 8 mm.
 _TOLERANCE_01 = 0.01
-_GRAVITY_NED_M_S2 = np.array([0.0, 0.0, GRAVITY_M_S2])
 _MIN_THRUST_M_S2 = 1.0  # without thrust, tilt would have no effect in the model
 
 
@@ -94,7 +93,7 @@ class JointMpc:
     def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
         start, steps, ahead = problem.start, self.steps, self._mpc.prediction
         acting = _joined(start.tilt, start.virtual_control[2]), _joined(start.tilt_rate_1_s, 0.0)
-        drift_m_s2 = problem.disturbance_ned_m_s2 + _GRAVITY_NED_M_S2
+        drift_m_s2 = problem.disturbance_ned_m_s2 + GRAVITY_NED_M_S2
         solve = partial(self._solve, problem, spaces, acting, drift_m_s2)
         first = solve(np.full(steps, max(_MIN_THRUST_M_S2, float(start.virtual_control[2]))))
         found = solve(first.u[:, 2])
@@ -126,7 +125,7 @@ class JointMpc:
         drift_m_s2: Array,
         thrust_m_s2: Array,
     ) -> AxesSolution:
-        """Solve with the lever of the tilt that a thrust gives.
+        """Solve the problem in which the products of tilt and thrust are linearised at a thrust.
 
         Args:
             problem, spaces: of this step.

@@ -9,7 +9,7 @@ a constant drift of each axis. Of a flight volume the z problem has floor and ce
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Literal
@@ -329,19 +329,18 @@ def planned(
     began_ns = stopwatch_ns()
     spaces = spaces_of(separation)
     best = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
-    others = _relaxed(separation)
-    while (
-        spaces is not None and best.status is PlanStatus.NOT_CERTIFIED and (relaxed := next(others, None)) is not None
-    ):
-        began_ns, before, spaces = stopwatch_ns(), spaces, spaces_of(relaxed)
+    for relaxed in _relaxed(separation):
+        if spaces is None or best.status is not PlanStatus.NOT_CERTIFIED:
+            return best
+        began_ns, before, spaces = stopwatch_ns(), spaces, spaces_of(separation.model_copy(update=relaxed))
         if spaces is not None and not _are_equal(spaces, before):
             found = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
             best = found if found.status in (PlanStatus.OK, PlanStatus.NOT_CERTIFIED) else best
     return best
 
 
-def _relaxed(separation: SeparationParams) -> Iterator[SeparationParams]:
-    """Yield parameters of half-spaces for a plan that comes closer than is ever flown.
+def _relaxed(separation: SeparationParams) -> tuple[dict[str, float], ...]:
+    """Return what differs in parameters of half-spaces for a plan that comes closer than is ever flown.
 
     - Without the gate: a plan may move far away from a guess that stands still, while half-spaces far from the guess
       are left out. It then runs into peers that are there by the time it arrives, as does the next from that guess.
@@ -349,9 +348,7 @@ def _relaxed(separation: SeparationParams) -> Iterator[SeparationParams]:
       several sides, and one slack for each of them lets a plan come too close within the horizon as well. Agents that
       always fly with less room to stop lack it when a peer drops out.
     """
-    every = separation.model_copy(update={"gate_m": math.inf})
-    yield every
-    yield every.model_copy(update={"stop_m_s2": separation.brake_m_s2})
+    return {"gate_m": math.inf}, {"gate_m": math.inf, "stop_m_s2": separation.brake_m_s2}
 
 
 def _are_equal(one: HalfSpaces, other: HalfSpaces) -> bool:

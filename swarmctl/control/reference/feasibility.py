@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.mission import MissionReference, Motion
 from swarmctl.core.flight_volume import FlightVolume
-from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.frames import GRAVITY_NED_M_S2
 from swarmctl.core.goal import REACHED_M
 from swarmctl.core.types import Array
 
@@ -157,7 +157,7 @@ def _motion_rules(t_s: Array, motion: Motion, model: VehicleModelParams) -> list
     least, most = model.thrust_range_m_s2()
     unexplained = np.diff(pos, axis=0) - 0.5 * step_s * (vel[1:] + vel[:-1])
     jump = np.append(np.linalg.norm(unexplained, axis=1), 0.0)
-    force = np.array([0.0, 0.0, GRAVITY_M_S2]) - accel - model.drag_1_s * vel  # thrust over mass, up positive
+    force = GRAVITY_NED_M_S2 - accel - model.drag_1_s * vel  # thrust over mass, up positive
     tilt = np.arctan2(np.linalg.norm(force[:, :2], axis=1), force[:, 2])
     thrust, harsh = np.linalg.norm(force, axis=1), np.linalg.norm(accel, axis=1)
     tilts = f"which needs more tilt than vehicle_model.tilt_max_rad = {model.tilt_max_rad:g}"
