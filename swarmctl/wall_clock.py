@@ -1,21 +1,29 @@
-"""The host's clocks: monotonic time, comparable between processes of one host, and UTC whose steps are slewed."""
+"""The host's clocks: monotonic time, comparable between processes of one host, and UTC whose steps are slewed.
+
+Monotonic time goes on while the host is suspended, as the vehicle does: its mode is in doubt after such a pause.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 
+_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # Linux alone has it
 _UTC_SLEW_01 = 0.01  # largest correction of UTC per elapsed time
 
 
 def monotonic_us() -> int:
-    """Return CLOCK_MONOTONIC [us], which is comparable between processes of this host."""
-    return time.monotonic_ns() // 1000
+    """Return monotonic time [us], which is comparable between processes of this host."""
+    return _monotonic_ns() // 1000
 
 
 def utc_us() -> int:
     """Return UTC as the host has it at this moment [us]."""
     return time.time_ns() // 1000
+
+
+def _monotonic_ns() -> int:
+    return time.clock_gettime_ns(_CLOCK)
 
 
 class WallClock:
@@ -26,7 +34,7 @@ class WallClock:
     """
 
     def __init__(
-        self, monotonic_ns: Callable[[], int] = time.monotonic_ns, utc_ns: Callable[[], int] = time.time_ns
+        self, monotonic_ns: Callable[[], int] = _monotonic_ns, utc_ns: Callable[[], int] = time.time_ns
     ) -> None:
         self._monotonic_ns, self._utc_ns = monotonic_ns, utc_ns
         self._read_ns = monotonic_ns()

@@ -33,7 +33,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
-from swarmctl.wall_clock import utc_us
+from swarmctl.wall_clock import monotonic_us, utc_us
 
 HOST = "127.0.0.1"
 LOCAL_PORT = 24580
@@ -125,14 +125,14 @@ def fly(clients: Sequence[Client], seconds: float) -> None:
     by_fd = {client.sock.fileno(): client for client in clients}
     for fd in by_fd:
         poller.register(fd, select.EPOLLIN)
-    now_us = time.monotonic_ns() // 1000
+    now_us = monotonic_us()
     end_us = now_us + round(seconds * 1e6)
     spread_us = SETPOINT_US // len(clients)
     due = [now_us + i * spread_us for i in range(len(clients))]
     beat_us = [now_us + i * spread_us for i in range(len(clients))]
     while now_us < end_us:
         poller.poll(max(0.0, (min(due) - now_us) * 1e-6))
-        now_us = time.monotonic_ns() // 1000
+        now_us = monotonic_us()
         offset_us = utc_us() - now_us
         for i, client in enumerate(clients):
             client.drain(offset_us)

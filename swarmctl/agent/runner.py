@@ -252,7 +252,8 @@ def _loop(
         pace.done(now_us + round(record.timing.tick_ms * 1000), clock.now_us())
         if record.mode is not Mode.STATE_STALE:
             seen_us, ever_seen = now_us, True
-        _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle, agent.refused_frames)
+        if not agent.done:  # who has landed waits for its peers, and may be switched off
+            _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle, agent.refused_frames)
         if agent.done if only_land else agent.finished:
             finished_us = finished_us or now_us
             if now_us - finished_us > _LINGER_S * 1e6:

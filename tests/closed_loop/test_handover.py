@@ -19,12 +19,13 @@ from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
 from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.control.reference.heading import Heading
 from swarmctl.core.frames import euler_from_quat
-from swarmctl.core.types import FlightMode, Phase, VehicleState
+from swarmctl.core.types import FlightMode, Mode, Phase, VehicleState
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import PipeTransport
 from swarmctl.mavlink.vehicle import mode_watch, state_samples
-from tests.closed_loop.conftest import AT_100_HZ, FINE, Fly, closer_than, mission_t_s
+from swarmctl.simulator_config import FaultParams
+from tests.closed_loop.conftest import AT_100_HZ, COARSE, FINE, Fly, closer_than, mission_t_s
 
 SETPOINT = 82  # SET_ATTITUDE_TARGET
 SLEEP_S = 1.62  # the first tick afterwards receives a state but no mode
@@ -285,3 +286,21 @@ def test_at_the_handover_it_turns_from_its_own_heading_at_a_bounded_rate() -> No
 def test_negative_control_without_its_own_heading_it_is_turned_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Heading, "begin", lambda *_: None)
     assert turned_rad_s() > 2.3
+
+
+@pytest.mark.parametrize("after_s", [1.3, 1.7, 2.1])
+def test_resume_takes_back_a_vehicle_that_its_failsafe_has_landed(after_s: float) -> None:
+    """Its status stays critical until the next HEARTBEAT, up to a second after it follows setpoints again."""
+    in_air = ("swarm.agents=1", "mission.duration_s=60", "sitl.start=air", "swarm.origin_alt_m=470")
+    flight = Lockstep(load(None, (*COARSE, *in_air)))
+    while not mission_t_s(flight) > 3.0:
+        flight.step()
+    loss = FaultParams(kind="link_loss", vehicle=0, value=1.0, for_s=1.0)
+    flight.world.faults.begin(loss, flight.world.since_boot_us)
+    for _ in range(round(after_s * 25)):
+        flight.step()
+    assert flight.logs[0].rows[-1][0]["mode"] == Mode.PILOT_OVERRIDE
+    flight.command("resume", 0)
+    for _ in range(4 * 25):
+        flight.step()
+    assert flight.logs[0].rows[-1][0]["mode"] == Mode.TRACKING

@@ -28,6 +28,7 @@ from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.view.recordings import optimize_recording, viewer_binary
+from swarmctl.wall_clock import monotonic_us
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(120)]
 
@@ -73,7 +74,7 @@ class Swarm:
 
     def payload(self, agent: int) -> bytes:
         row = np.zeros(1, TICK_DTYPE)
-        row["t_us"], row["utc_us"], row["seq"] = time.monotonic_ns() // 1000, time.time_ns() // 1000, self.seq
+        row["t_us"], row["utc_us"], row["seq"] = monotonic_us(), time.time_ns() // 1000, self.seq
         row["phase"], row["mode"], row["mission_t_s"] = Phase.TRACK, Mode.TRACKING, self.seq * 0.02
         if self.seq % 50 == 25:
             row["mode"], row["plan_status"] = Mode.REPLAY, PlanStatus.SOLVER_FAILED

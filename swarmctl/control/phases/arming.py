@@ -1,13 +1,16 @@
 """Decides whether a vehicle is known to be disarmed, although HEARTBEATs lag behind arm requests.
 
 An autopilot acknowledges arming at once and reports `armed` in its next HEARTBEAT, up to a second later. Until then the
-newest HEARTBEAT says "disarmed" about a vehicle whose motors turn.
+newest HEARTBEAT says "disarmed" about a vehicle whose motors turn. A copy of that one may arrive even later, from a
+queue or a second way: soon after "armed" a single "disarmed" proves nothing.
 """
 
 from __future__ import annotations
 
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.types import VehicleState
+
+_COPIES_US = 5_000_000  # from "armed" on, within which a HEARTBEAT of before may arrive again
 
 
 class ArmingEvidence:
@@ -21,6 +24,8 @@ class ArmingEvidence:
         self.requested = False
         self._open = False  # an arm request may still be on its way
         self._settled_us: int | None = None  # a HEARTBEAT before this time proves nothing
+        self._armed_us: int | None = None  # arrival of the HEARTBEAT that first told of being armed
+        self._denied_us: int | None = None  # and of the first of those that tell the opposite since
 
     def request(self) -> None:
         """Note that arming is requested now."""
@@ -31,12 +36,26 @@ class ArmingEvidence:
 
         HEARTBEATs received before the first tick, or while an arm request is open, prove nothing.
         """
+        if inputs.state is not None:
+            self._note(inputs.armed_told_us, is_armed=inputs.state.armed)
         if self._settled_us is None or self._open:
             self._settled_us = inputs.now_us
         self._open = self._open and inputs.busy
 
     def is_disarmed(self, inputs: PhaseInputs, state: VehicleState) -> bool:
-        """Return whether a HEARTBEAT newer than every arm request reports the vehicle as disarmed."""
+        """Return whether a HEARTBEAT newer than every arm request reports the vehicle as disarmed.
+
+        Soon after it was told to be armed, two of them have to.
+        """
         if state.armed or self._open or self._settled_us is None:
             return False
+        if self._denied_us is not None and self._armed_us is not None and self._denied_us - self._armed_us < _COPIES_US:
+            return inputs.armed_told_us > self._denied_us
         return inputs.armed_told_us > self._settled_us
+
+    def _note(self, told_us: int, *, is_armed: bool) -> None:
+        if is_armed:
+            if self._armed_us is None or self._denied_us is not None:
+                self._armed_us, self._denied_us = told_us, None
+        elif self._armed_us is not None and self._denied_us is None:
+            self._denied_us = told_us

@@ -32,7 +32,6 @@ from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 from swarmctl.mavlink.vehicle.vehicle_health import VehicleHealth
 
 _ARMED_FLAG = 128
-_CRITICAL = 5
 _PREARM = 1 << 28
 _KNOWS_POSITION = 8 | 16  # ESTIMATOR_POS_HORIZ_REL, ESTIMATOR_POS_HORIZ_ABS
 _DRIFT_M_S2 = 0.05  # 1-sigma error without GPS over time squared; measured: 0.6 m after 8 s to 2.7 m after 4 s
@@ -40,6 +39,7 @@ _LOST_REPORTS = 2  # one after the other, a second apart: flags drop out for a m
 _LOCAL_POSITION = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED  # its time stamps are those of the state
 _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
+_ATTENDED_US = 300_000  # without news of the vehicle nobody flies it
 _HOVER_M_S = 0.2
 _MOST_PARAMETERS = 5000  # an autopilot has some 1500
 _MOST_TEXTS = 20  # that wait to be read
@@ -169,6 +169,19 @@ class Autopilot:
             return None
         return self._state(now_us)
 
+    def is_attended(self, now_us: int) -> bool:
+        """Return whether somebody can fly the vehicle, so that its autopilot need not act as without a link.
+
+        The agent can't while it knows no recent state, and a pilot may, as long as another mode is told. On a link that
+        has failed in one direction alone, heartbeats would keep an ArduCopter flying straight on. Before the first
+        state they say where messages are to be sent.
+        """
+        sample, told_us = self.states.newest, self.received_us
+        if sample is None or now_us - sample.t_us <= _ATTENDED_US:
+            return True
+        is_heard = told_us is not None and now_us - told_us <= _ATTENDED_US
+        return is_heard and self.mode is not FlightMode.EXTERNAL
+
     def send(self, setpoint: AttitudeSetpoint, now_us: int) -> str:
         """Send one setpoint and return the reason of a refusal, or ""."""
         return self.setpoints.send(setpoint, now_us, self.setpoint_loss_s, self.watch.departures)
@@ -213,9 +226,8 @@ class Autopilot:
             return
         self.dialect, mode = dialect, dialect.mode(message.custom_mode)
         self.armed, self.armed_told_us = bool(message.base_mode & _ARMED_FLAG), arrived_us
-        only_warns = message.system_status == _CRITICAL and mode is FlightMode.EXTERNAL  # it still follows setpoints
-        self.watch.alarm(message.system_status >= _CRITICAL and not only_warns)
         self.watch.told(mode, arrived_us)
+        self.watch.status(message.system_status)
 
     def _current_mode(self, message: Any, arrived_us: int) -> None:
         """Take the mode as from a HEARTBEAT; sent on change, so that a pilot's switch is seen within a tick."""

@@ -12,6 +12,7 @@ from swarmctl.core.types import FlightMode
 _GAP_US = 300_000  # length of a silence, of the agent or the link, that puts the mode in doubt
 _TOLD_LATELY_US = 100_000  # a mode report this young at the end of our own pause was not delayed in a full buffer
 _REQUEST_PERIOD_US = 60_000
+_CRITICAL = 5  # MAV_STATE
 
 
 class ModeWatch:
@@ -19,14 +20,13 @@ class ModeWatch:
 
     Attributes:
         mode: newest reported mode.
-        failsafe: newest report whether the autopilot's failsafe acts.
         departures: number of departures from the mode that follows setpoints.
         told_us: arrival time of the message that reported the mode.
     """
 
     def __init__(self) -> None:
         self.mode = FlightMode.UNKNOWN
-        self.failsafe = False
+        self._status = 0  # MAV_STATE
         self.departures = self.told_us = 0
         self._left: FlightMode | None = None  # intermediate mode of a departure that was not shown yet
         self._alarmed = False  # a failsafe that was not shown yet
@@ -62,10 +62,20 @@ class ModeWatch:
             self._left = mode
         self.mode, self.told_us = mode, arrived_us
 
-    def alarm(self, failsafe: bool) -> None:
-        """Take the failsafe state of a HEARTBEAT."""
-        self.failsafe = failsafe
-        self._alarmed |= failsafe
+    def status(self, status: int) -> None:
+        """Take the MAV_STATE of a HEARTBEAT, after its mode."""
+        self._status = status
+        self._alarmed |= self.failsafe
+
+    @property
+    def failsafe(self) -> bool:
+        """Whether the autopilot's failsafe acts, by the newest HEARTBEAT and the newest mode.
+
+        An autopilot that follows setpoints while its status is critical only warns. An operator's resume is told by
+        CURRENT_MODE, up to a second before the next HEARTBEAT.
+        """
+        only_warns = self._status == _CRITICAL and self.mode is FlightMode.EXTERNAL
+        return self._status >= _CRITICAL and not only_warns
 
     def asks(self, now_us: int) -> bool:
         """Whether to request a HEARTBEAT now."""

@@ -2,8 +2,9 @@
 
 A stamp that arrives at y was taken at y or before: the line under all points (stamp, arrival) that touches the earliest
 ones is the clock seen through the shortest delay. An answered TIMESYNC bounds the line from the other side, because the
-answer is later than the request, and gives the shortest delay. Autopilot clocks run up to some percent off ours, and
-simulated ones also stand still.
+answer is later than the request, and gives the shortest delay. Delays that creep up look like a slower clock, but move
+the bounds apart: by as much as they have never been before, stamps are older. Autopilot clocks run up to some percent
+off ours, and simulated ones also stand still.
 
 A stamp far in the past, or ahead of what the line allows, is refused. The clock is taken to have restarted only when
 several refused stamps follow and agree with each other, and the vehicle to have rebooted only when the boot time of
@@ -12,6 +13,7 @@ another message agrees with them.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass
@@ -34,7 +36,7 @@ _BOUND_SLACK_US = 1_000
 _MOVED_US = 5_000  # a line farther below the bound is older than a stop of the clock; else the bound corrects it
 _UNKNOWN_RATE_US = 200_000  # the same while no rate is known
 _LOOP_US = 4_000  # time an autopilot's loop may take to answer, of what is left between the bounds
-_QUESTIONS = 32  # requests remembered
+_QUESTIONS = 8  # requests remembered: a second and a half, in which a delay that creeps up gains little
 
 Point = tuple[float, float]  # stamp, arrival - stamp [us]
 
@@ -84,6 +86,7 @@ class VehicleClock:
         self._witnesses: dict[Hashable, deque[tuple[int, int]]] = {}
         self._asked: deque[Point] = deque(maxlen=_QUESTIONS)  # stamp of an answer, request - stamp
         self._left_us: float | None = None  # least distance of these from the line; None since one of both has changed
+        self._least_left_us = math.inf  # the least of those since the clock began
 
     @property
     def offset_us(self) -> float | None:
@@ -143,16 +146,20 @@ class VehicleClock:
 
     @property
     def _one_way_delay_us(self) -> float:
-        """Shortest one-way delay, which the line can't show: half of what the bounds leave between them.
+        """Shortest one-way delay of late, which the line can't show.
 
-        The bounds are the shortest delay of stamps, and the shortest delay of the remembered requests.
+        The bounds are the shortest delay of stamps, and the shortest delay of the remembered requests. Half of the
+        least that they have ever left between them is the delay of one way; which way has become slower since is
+        unknown, so all of what was added counts.
         """
         if not self._asked or not self._spans():  # until the rate is known the line may be far too low
             return 0.0
         if self._left_us is None:
             offset_us, rate = self._offset_us, self.rate
-            self._left_us = min([offset_us + rate * x - y for x, y in self._asked])
-        return 0.5 * max(0.0, self._left_us - _LOOP_US)
+            self._left_us = max(0.0, min([offset_us + rate * x - y for x, y in self._asked]))
+            self._least_left_us = min(self._least_left_us, self._left_us)
+        grown_us = max(0.0, self._left_us - self._least_left_us - _LOOP_US)
+        return 0.5 * max(0.0, self._least_left_us - _LOOP_US) + grown_us
 
     def _line(self, vehicle_us: float) -> float:
         """Host time minus vehicle time at a stamp, including the shortest delay."""
@@ -202,7 +209,7 @@ class VehicleClock:
         self._run, self._taken = None, 0
         self._points.clear()
         self._asked.clear()
-        self._floor = self._left_us = None
+        self._floor, self._left_us, self._least_left_us = None, None, math.inf
         self._newest_us, self.rate, self._offset_us = vehicle_us, 0.0, float(late_us)
 
     def _keep(self, x: float, y: float) -> bool:

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from swarmctl.agent.runner import Pace, StopOrder, _check_vehicle_silence
+from swarmctl.agent.runner import NOTHING_REFUSED, Pace, StopOrder, _check_vehicle_silence, _loop
 from swarmctl.bus.silence import SessionWatch
 from swarmctl.config import load
+from swarmctl.core.clock import SimClock
 from swarmctl.core.operator_verbs import Order
-from swarmctl.errors import MissionError, StartError
+from swarmctl.core.types import Mode
+from swarmctl.errors import EXIT_OK, MissionError, StartError
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.wall_clock import WallClock
+from swarmctl.wall_clock import WallClock, monotonic_us
 
 MS = 1_000
 
@@ -135,6 +139,46 @@ def test_an_agent_number_outside_the_swarm_is_refused_before_anything_is_opened(
     path.write_text("[swarm]\nagents = 2\n", encoding="utf-8")
     with pytest.raises(StartError, match=r"--id 2.*0\.\.1"):
         run_agent(AgentProcess(config_path=path, agent=2, run="run", bus="tcp/127.0.0.1:1", run_dir=tmp_path))
+
+
+@pytest.mark.parametrize("has_landed", [True, False])
+def test_who_has_landed_may_be_switched_off_while_its_agent_waits_for_peers(has_landed: bool) -> None:
+    clock = SimClock()
+    stale = SimpleNamespace(mode=Mode.STATE_STALE, timing=SimpleNamespace(tick_ms=1.0))
+    seen = SimpleNamespace(mode=Mode.TRACKING, timing=SimpleNamespace(tick_ms=1.0))
+
+    class Landed:
+        ask, refused_frames, outcome, has_armed = None, NOTHING_REFUSED, "completed", True
+        done = has_landed
+
+        def tick(self, now_us: int, missed: int) -> Any:
+            return seen if now_us < 1_000_000 else stale
+
+        @property
+        def finished(self) -> bool:
+            return clock.now_us() > 40_000_000  # when the last peer is done
+
+    def fly() -> int:
+        def sleep_until(t_us: int) -> None:
+            clock.advance(max(1, t_us - clock.now_us()))
+
+        agent: Any = Landed()
+        paced: Any = SimpleNamespace(now_us=clock.now_us, sleep_until=sleep_until)
+        stop: Any = SimpleNamespace(take=lambda: False)
+        sessions: Any = SimpleNamespace(step=lambda: None)
+        return _loop(agent, load(None), paced, stop, sessions, vehicle="udpin://x", only_land=False)
+
+    if has_landed:
+        assert fly() == EXIT_OK
+    else:
+        with pytest.raises(MissionError, match="silent for 15 s"):
+            fly()
+
+
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="Linux alone tells how long it was suspended")
+def test_time_goes_on_while_the_host_is_suspended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "clock_gettime_ns", {time.CLOCK_BOOTTIME: 9_000_000_000}.__getitem__)
+    assert (WallClock().now_us(), monotonic_us()) == (9_000_000, 9_000_000)
 
 
 def test_a_step_of_the_hosts_utc_is_followed_slowly() -> None:

@@ -167,7 +167,7 @@ def test_stopping_on_the_ground_never_takes_off() -> None:
     assert armed.at == "LAND"
     assert armed.run(0.5) == [Verb.DISARM]
     armed.armed = False
-    armed.run(0.1)
+    armed.run(0.2)
     assert armed.at == "DONE"
 
 

@@ -36,7 +36,48 @@ def test_a_stop_between_the_acknowledgement_of_arming_and_its_heartbeat_disarms(
     assert flight.at == "LAND"
     flight.armed, flight.beat_us = False, flight.now_us
     flight.run(0.2)
+    assert flight.at == "LAND", "a copy of the HEARTBEAT from before it was armed says the same"
+    flight.beat_us = flight.now_us
+    flight.run(0.2)
     assert (flight.at, flight.mission.outcome) == ("DONE", OPERATOR_STOP)
+
+
+def test_a_copy_of_a_heartbeat_from_before_it_was_armed_ends_no_take_off() -> None:
+    flight = Flight().until(Phase.TAKEOFF)
+    flight.run(0.3)
+    flight.armed, flight.beat_us = False, flight.now_us
+    flight.run(0.5)
+    assert flight.at == "TAKEOFF"
+    flight.armed, flight.beat_us = True, flight.now_us
+    flight.run(0.5)
+    assert flight.at == "TAKEOFF"
+    flight.armed = False
+    for _ in range(2):  # now it is disarmed indeed
+        flight.beat_us = flight.now_us
+        flight.run(0.5)
+    assert (flight.at, flight.mission.outcome) == ("DONE", "disarmed before take-off")
+
+
+def test_a_vehicle_that_stands_and_is_not_disarmed_by_its_autopilot_is_disarmed() -> None:
+    flight = Flight().until(Phase.LAND)
+    flight.flight_mode, flight.landed, flight.armed = FlightMode.LAND, IN_AIR, True
+    assert flight.run(20.0) == []
+    flight.landed = ON_GROUND
+    assert flight.run(4.5) == [], "an autopilot disarms by itself"
+    flight.landed = IN_AIR
+    flight.run(0.2)
+    flight.landed = ON_GROUND
+    assert flight.run(4.5) == [], "it has to stand for as long as that"
+    assert flight.run(1.0) == [Verb.DISARM]
+
+
+def test_long_after_it_was_armed_one_heartbeat_suffices() -> None:
+    flight = Flight().until(Phase.TAKEOFF)
+    flight.run(6.0)
+    flight.ask("land")
+    flight.armed, flight.beat_us = False, flight.now_us
+    flight.run(0.1)
+    assert flight.at == "DONE"
 
 
 def test_a_refusal_after_an_arm_request_disarms_before_giving_up() -> None:

@@ -276,6 +276,44 @@ def test_a_failsafe_that_came_and_went_between_two_polls_is_shown_once() -> None
     assert not flying(bench, 0.02, mode_hz=0.0).failsafe
 
 
+def test_a_status_told_in_another_mode_is_no_failsafe_of_who_follows_setpoints_again() -> None:
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    bench.heartbeat(PX4_LAND, status=5)
+    assert flying(bench, 0.5, mode_hz=0.0).failsafe
+    bench.say(dialect.MAVLink_current_mode_message(0, PX4_OFFBOARD, 0))  # an operator has resumed
+    bench.poll()
+    state = flying(bench, 0.1, mode_hz=0.0)
+    assert (state.mode, state.failsafe) == (FlightMode.EXTERNAL, False)
+    bench.say(dialect.MAVLink_current_mode_message(0, PX4_LAND, 0))
+    assert flying(bench, 0.1, mode_hz=0.0).failsafe, "by the newest mode, whatever has told it"
+
+
+def test_a_vehicle_is_told_that_it_is_attended_only_while_somebody_can_fly_it() -> None:
+    bench = Bench()
+
+    def is_attended() -> bool:
+        bench.poll()
+        return bench.pilot.is_attended(bench.clock.now_us())
+
+    assert is_attended(), "before the first state heartbeats say where to send it to"
+    bench.ready()
+    flying(bench, 1.0)
+    assert is_attended()
+    bench.clock.advance(250_000)
+    assert is_attended(), "a gap is none"
+    bench.clock.advance(100_000)
+    assert not is_attended(), "nothing is heard"
+    bench.heartbeat()
+    assert not is_attended(), "it follows setpoints, and nobody can send any"
+    bench.heartbeat(PX4_HOLD)
+    assert is_attended(), "a pilot may fly it"
+    bench.clock.advance(350_000)
+    assert not is_attended()
+    flying(bench, 0.1)
+    assert is_attended()
+
+
 def test_a_setpoint_gap_in_which_the_failsafe_may_have_acted_is_counted() -> None:
     bench = Bench().ready()
     bench.say(dialect.MAVLink_param_value_message(b"COM_OF_LOSS_T", 0.5, 9, 1, 0))

@@ -304,3 +304,16 @@ def test_a_ground_station_beats_once_a_second_whatever_happens() -> None:
     assert len(beats) == 10
     assert beats[0][5:7] == bytes([5, 191])
     assert struct.unpack("<I5B", beats[0][10:-2]) == (0, 6, 8, 0, 4, 3)  # ground station, active
+
+
+def test_heartbeats_stop_while_nobody_attends_to_the_vehicle_and_commands_do_not() -> None:
+    bench = Bench()
+    bench.port.request(Command(verb=Verb.ARM))
+    sent = []
+    for k in range(500):  # 10 s, of which 3 to 7 unattended
+        bench.port.step(20_000 * k, assures=not 150 <= k < 350)
+        sent += [(k, dialect.MAVLink(None).decode(bytearray(frame)).get_type()) for frame in bench.out]
+        bench.out.clear()
+    beats = [k for k, kind in sent if kind == "HEARTBEAT"]
+    assert beats == [0, 50, 100, 350, 400, 450]
+    assert any(kind == "COMMAND_LONG" for _, kind in sent)

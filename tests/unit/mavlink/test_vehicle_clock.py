@@ -19,7 +19,7 @@ class Link:
     def __init__(self, clock: VehicleClock, rate: float, base_us: float = 300.0, asked: bool = True) -> None:
         self.clock, self.rate, self.base_us, self.asked = clock, rate, base_us, asked
         self.witnessed, self.unknown = False, 0  # samples without a time
-        self.now_us, self.vehicle_us = 0.0, float(BOOTED_US)
+        self.now_us, self.vehicle_us, self.queue_us = 0.0, float(BOOTED_US), 0.0
         self._random = random.Random(7)
 
     def delay_us(self) -> float:
@@ -27,15 +27,19 @@ class Link:
         late = 30_000.0 * self._random.random() if self._random.random() < 0.02 else 0.0
         return self.base_us + self._random.expovariate(1.0 / 1500.0) + late
 
-    def run(self, seconds: float, still: bool = False) -> float:
-        """Largest error [us] of the mapped times of samples sent meanwhile; `still`: the vehicle's clock stops."""
+    def run(self, seconds: float, still: bool = False, slower: float = 0.0) -> float:
+        """Largest error [us] of the mapped times of samples sent meanwhile.
+
+        `still`: the vehicle's clock stops; `slower`: its messages take as much longer with every second.
+        """
         worst = 0.0
         for k in range(round(seconds * 1e6 / TICK_US)):
             self.now_us += TICK_US
             if still:
                 continue
             self.vehicle_us += TICK_US * self.rate
-            arrived_us = round(self.now_us + self.delay_us())
+            self.queue_us += TICK_US * slower
+            arrived_us = round(self.now_us + self.queue_us + self.delay_us())
             if self.witnessed:
                 self.clock.witness("ATTITUDE", round(self.vehicle_us), arrived_us)
             found_us = self.clock.to_local(round(self.vehicle_us), arrived_us)
@@ -45,7 +49,9 @@ class Link:
             if self.asked and k % 20 == 0:
                 up_us, down_us = self.delay_us(), self.delay_us()
                 stamp_us = self.vehicle_us + up_us * self.rate
-                self.clock.round_trip(round(self.now_us), round(stamp_us), round(self.now_us + up_us + down_us))
+                self.clock.round_trip(
+                    round(self.now_us), round(stamp_us), round(self.now_us + up_us + self.queue_us + down_us)
+                )
         return worst
 
 
@@ -90,6 +96,16 @@ def test_a_rate_that_changes_is_followed() -> None:
     link.rate = 0.95  # a simulator short of CPU
     assert link.run(2.0) < 32_000
     assert link.run(10.0) < 3_000
+
+
+@pytest.mark.parametrize("slower", [0.02, 0.05, 0.1])
+def test_delays_that_creep_up_make_no_old_sample_young(slower: float) -> None:
+    link = Link(VehicleClock(), 0.99)
+    link.run(20.0)
+    assert link.run(10.0, slower=slower) < 1.8e6 * slower, "late by what creeps up within the remembered requests"
+    unasked = Link(VehicleClock(), 0.99, asked=False)
+    unasked.run(20.0)
+    assert unasked.run(10.0, slower=slower) > 8e6 * slower  # control: takes it for the rate of the clock
 
 
 def test_congestion_for_two_seconds_makes_no_old_sample_young() -> None:

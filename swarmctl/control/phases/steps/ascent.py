@@ -19,7 +19,8 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
         mission.enter(Phase.GOTO_START, inputs.now_us)
         return []
     if not state.armed:  # pilot or autopilot disarmed it: it is not armed again
-        mission.give_up("disarmed before take-off", inputs, state)
+        if mission.arming.is_disarmed(inputs, state):
+            mission.give_up("disarmed before take-off", inputs, state)
         return []
     others = handover.is_under_other_control(state)
     mission.climb.was_ours |= not others

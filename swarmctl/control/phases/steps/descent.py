@@ -10,6 +10,8 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.mission_state import PLAN_MODES, TAKEN_OVER, MissionState
 from swarmctl.core.types import Command, FlightMode, Landed, Phase, VehicleState, Verb
 
+_STANDS_US = 5_000_000  # that an autopilot has to disarm by itself
+
 
 def goto_land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
     """Fly to the landing place; after too long, land where the vehicle is."""
@@ -42,7 +44,7 @@ def land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> lis
         return []
     if state.mode is FlightMode.LAND:
         mission.landing_seen = True
-        return []
+        return _disarmed_late(mission, inputs, state)
     ours = state.mode in handover.OWN_MODES and not mission.landing_seen  # else a pilot flies, or aborted the landing
     if not ours and state.landed is not Landed.ON_GROUND:
         mission.override(TAKEN_OVER, inputs.now_us)
@@ -50,3 +52,11 @@ def land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> lis
     if not mission.may_request(inputs):
         return []
     return [Command(verb=Verb.DISARM if state.landed is Landed.ON_GROUND else Verb.LAND)]
+
+
+def _disarmed_late(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    """Disarm a vehicle that stands, where its autopilot does not: PX4 with COM_DISARM_LAND -1 never would."""
+    if state.landed is not Landed.ON_GROUND:
+        mission.requested_us = inputs.now_us
+        return []
+    return [Command(verb=Verb.DISARM)] if mission.may_request(inputs, _STANDS_US) else []
