@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import pyarrow.parquet as pq
@@ -233,3 +235,43 @@ def test_a_killed_agent_leaves_nothing_armed(field: Fielder, phase: str) -> None
     while time.monotonic() < until_s and here.witness.vehicles[0].armed:
         time.sleep(0.2)
     assert not here.witness.vehicles[0].armed or "armed" in launched.text(), launched.text()
+
+
+LAND = 9  # of an ArduCopter
+ACTS_S = 6.0  # FS_GCS_TIMEOUT, after the last heartbeat, and the witness's own heartbeat
+RELAY = """
+import selectors, signal, socket
+port, beyond = {ports}
+ears = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)  # towards the vehicle
+mouth = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)  # towards the agent
+ears.bind(("127.0.0.1", port))
+vehicle, deaf = None, []
+signal.signal(signal.SIGUSR1, lambda *_: deaf.append(True))
+chosen = selectors.DefaultSelector()
+for one in (ears, mouth):
+    chosen.register(one, selectors.EVENT_READ)
+while True:
+    for key, _ in chosen.select():
+        if key.fileobj is ears:
+            data, vehicle = ears.recvfrom(4096)
+            if not deaf:
+                mouth.sendto(data, ("127.0.0.1", beyond))
+        elif vehicle is not None:
+            ears.sendto(mouth.recv(4096), vehicle)
+"""
+
+
+def test_an_arducopter_that_its_agent_does_not_hear_lands_by_its_own_failsafe(field: Fielder) -> None:
+    here = booted(field, 1)
+    relay = subprocess.Popen([*here.fleet.network.prefix, sys.executable, "-c", RELAY.format(ports=(14550, 24550))])
+    try:
+        launched = here.launch(ARDUPILOT_CONFIG, "--set", 'vehicles=[{sysid=1, url="udpin://127.0.0.1:24550"}]')
+        launched.until_phase("TRACK", 1)
+        time.sleep(3.0)
+        relay.send_signal(signal.SIGUSR1)
+        here.witness.wait(lambda: mode_of(here, 0) == LAND, ACTS_S, "landing")
+        here.witness.wait(lambda: not here.witness.vehicles[0].armed, GROUND_S, "landed and disarmed")
+        assert launched.end(END_S) == EXIT_MISSION, launched.text()
+    finally:
+        relay.kill()
+        relay.wait()

@@ -277,6 +277,7 @@ class Autopilot:
         self.landed, self.armable, self.health = Landed.UNKNOWN, False, VehicleHealth()
         self.params, self.whole_params = {}, set()
         self.hover_thrust_01 = self.pos_accuracy_m = None
+        self._gps_sigma_m = 0.0
         self._unaided = 0  # reports in a row of an estimator that knows no position
         self.frame.forget()
 
@@ -311,7 +312,8 @@ class Autopilot:
     def _gps(self, message: Any, arrived_us: int) -> None:
         self.health.gps(message, arrived_us)
         drift_m = _DRIFT_M_S2 * self.health.fix_missing_s**2  # without a fix its own figure stays what it was
-        self._accuracy("GPS_RAW_INT", message.h_acc * 1e-3 + drift_m)
+        self._gps_sigma_m = message.h_acc * 1e-3 or self._gps_sigma_m  # 0 is unknown, as without a fix
+        self._accuracy("GPS_RAW_INT", self._gps_sigma_m + drift_m)
 
     def _accuracy(self, source: str, sigma_m: float) -> None:
         """Take an accuracy [m] from the message that the dialect names; not 0, which both messages use for unknown."""

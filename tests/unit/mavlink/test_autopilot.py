@@ -444,3 +444,16 @@ def test_what_the_autopilot_says_is_kept_in_order_and_of_a_flood_the_newest() ->
     bench.poll()
     said = list(iter(bench.pilot.next_text, None))
     assert said == [(4, f"fence {k}\\x1b") for k in range(10, 30)]
+
+
+@pytest.mark.parametrize("told_mm", [500, 0], ids=["as before", "none"])
+def test_without_a_fix_the_accuracy_gets_worse_from_the_last_one_that_was_told(told_mm: int) -> None:
+    bench = Bench().ready()
+    bench.heartbeat(4, autopilot=3)  # an ArduCopter
+    for k in range(40):
+        has_fix = k < 20
+        accuracy_mm = 500 if has_fix else told_mm
+        bench.say(dialect.MAVLink_gps_raw_int_message(0, 3 if has_fix else 1, 0, 0, 0, 0, 0, 0, 0, 10, 0, accuracy_mm))
+        bench.clock.advance(100_000)
+        bench.poll()
+    assert bench.pilot.pos_accuracy_m == pytest.approx(0.5 + 0.05 * 2.0**2, abs=0.03)

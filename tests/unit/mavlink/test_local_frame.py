@@ -186,6 +186,22 @@ def test_an_estimate_that_jumps_back_leaves_the_vehicle_where_it_is(by_01: float
     assert vehicle.frame.margin_m == 0.0
 
 
+@pytest.mark.parametrize("moved_m", [0.8, 5.0])
+def test_an_origin_that_moves_with_a_reset_is_asked_for(moved_m: float) -> None:
+    vehicle = flying()
+    vehicle.origin = vehicle.origin + [moved_m, 0.0, 0.0]  # its GPS_GLOBAL_ORIGIN is lost
+    vehicle.t_us += STEP_US
+    vehicle.true = vehicle.true + EAST * STEP_US * 1e-6
+    vehicle.frame.place(vehicle.t_us, vehicle.true - vehicle.origin, EAST, True, reset=True)
+    vehicle.fly(0.1)
+    assert vehicle.frame.wants_origin
+    vehicle.say()
+    placed = vehicle.fly(20.0)
+    assert vehicle.error_m(placed) < 0.02, "nothing is drawn in"
+    assert not vehicle.frame.wants_origin
+    assert vehicle.frame.margin_m == 0.0
+
+
 def test_a_step_that_the_estimator_tells_of_is_bridged_however_small() -> None:
     for reset, jumps in ((False, 0), (True, 1)):
         vehicle = flying()
