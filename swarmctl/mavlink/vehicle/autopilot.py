@@ -226,13 +226,13 @@ class Autopilot:
             return
         self.dialect, mode = dialect, dialect.mode(message.custom_mode)
         self.armed, self.armed_told_us = bool(message.base_mode & _ARMED_FLAG), arrived_us
-        self.watch.told(mode, arrived_us)
+        self.watch.told(mode, arrived_us, by_heartbeat=True)
         self.watch.status(message.system_status)
 
     def _current_mode(self, message: Any, arrived_us: int) -> None:
         """Take the mode as from a HEARTBEAT; sent on change, so that a pilot's switch is seen within a tick."""
         if self.dialect is not None:
-            self.watch.told(self.dialect.mode(message.custom_mode), arrived_us)
+            self.watch.told(self.dialect.mode(message.custom_mode), arrived_us, by_heartbeat=False)
 
     def _ask_for(self, message_id: int) -> None:
         asked = (float(message_id), *(0.0,) * 6)

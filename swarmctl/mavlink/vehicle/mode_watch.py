@@ -1,8 +1,9 @@
 """Flight mode of a vehicle, the times when it is in doubt, and mode changes between two polls. Pure.
 
 One setpoint brings PX4 back to OFFBOARD even after a pilot has taken over. So after a silence, of agent or link, the
-mode is in doubt until the vehicle reports it again; a requested HEARTBEAT arrives within milliseconds. A mode or
-failsafe that came and went between two polls is shown once, although it is not the newest.
+mode is in doubt until the vehicle reports it again; a requested HEARTBEAT arrives within milliseconds. So it is when a
+HEARTBEAT contradicts a CURRENT_MODE that has just arrived: it may be a copy from before the change. A mode or failsafe
+that came and went between two polls is shown once, although it is not the newest.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from swarmctl.core.types import FlightMode
 _GAP_US = 300_000  # length of a silence, of the agent or the link, that puts the mode in doubt
 _TOLD_LATELY_US = 100_000  # a mode report this young at the end of our own pause was not delayed in a full buffer
 _REQUEST_PERIOD_US = 60_000
+_JUST_US = 200_000
 _CRITICAL = 5  # MAV_STATE
 
 
@@ -35,6 +37,7 @@ class ModeWatch:
         self._received_us: int | None = None
         self._requested_us: int | None = None
         self._doubt_us: int | None = None  # a mode report must be newer than this
+        self._changed_us = -_JUST_US  # arrival of the newest CURRENT_MODE
 
     @property
     def in_doubt(self) -> bool:
@@ -55,8 +58,13 @@ class ModeWatch:
             self._doubt_us = arrived_us  # the link was silent: frames of that time are lost
         self._received_us = arrived_us
 
-    def told(self, mode: FlightMode, arrived_us: int) -> None:
-        """Take the mode of a HEARTBEAT or CURRENT_MODE."""
+    def told(self, mode: FlightMode, arrived_us: int, *, by_heartbeat: bool) -> None:
+        """Take the mode of a HEARTBEAT, or of a CURRENT_MODE, which is sent when it changes."""
+        if not by_heartbeat:
+            self._changed_us = arrived_us
+        elif mode is not self.mode and arrived_us - self._changed_us < _JUST_US and not self.in_doubt:
+            self._doubt_us = arrived_us + 1
+            return
         if self.mode is FlightMode.EXTERNAL and mode is not FlightMode.EXTERNAL:
             self.departures += 1
             self._left = mode

@@ -267,6 +267,34 @@ def test_a_mode_that_came_and_went_between_two_polls_is_shown_once(custom_mode: 
     assert bench.pilot.watch.departures == 1
 
 
+def changed_to_offboard() -> Bench:
+    """A vehicle that has told its change to OFFBOARD, and 60 ms later tells HOLD in a HEARTBEAT."""
+    bench = Bench().ready()
+    bench.heartbeat(PX4_HOLD)
+    flying(bench, 1.0, mode_hz=0.0)
+    bench.say(dialect.MAVLink_current_mode_message(0, PX4_OFFBOARD, 0))
+    assert flying(bench, 0.06, mode_hz=0.0).mode is FlightMode.EXTERNAL
+    bench.heartbeat(PX4_HOLD)
+    assert flying(bench, 0.1, mode_hz=0.0) is None, "in doubt: nothing is sent"
+    return bench
+
+
+def test_a_copy_of_the_heartbeat_from_before_a_change_of_mode_is_no_takeover() -> None:
+    bench = changed_to_offboard()
+    asked = [dialect.MAVLink(None).decode(bytearray(frame)) for frame in bench.frames[-3:]]
+    assert any(m.get_type() == "COMMAND_LONG" and m.command == 512 for m in asked)
+    bench.heartbeat(PX4_OFFBOARD)
+    assert flying(bench, 0.02, mode_hz=0.0).mode is FlightMode.EXTERNAL
+    assert bench.pilot.watch.departures == 1, "the one before"
+
+
+def test_a_pilot_who_takes_over_right_after_a_change_of_mode_is_believed_with_the_second_heartbeat() -> None:
+    bench = changed_to_offboard()
+    bench.heartbeat(PX4_HOLD)
+    assert flying(bench, 0.02, mode_hz=0.0).mode is FlightMode.HOLD
+    assert bench.pilot.watch.departures == 2
+
+
 def test_a_failsafe_that_came_and_went_between_two_polls_is_shown_once() -> None:
     bench = Bench().ready()
     flying(bench, 1.0)

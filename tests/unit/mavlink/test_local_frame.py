@@ -189,7 +189,7 @@ def test_an_estimate_that_jumps_back_leaves_the_vehicle_where_it_is(by_01: float
 @pytest.mark.parametrize("moved_m", [0.8, 5.0])
 def test_an_origin_that_moves_with_a_reset_is_asked_for(moved_m: float) -> None:
     vehicle = flying()
-    vehicle.origin = vehicle.origin + [moved_m, 0.0, 0.0]  # its GPS_GLOBAL_ORIGIN is lost
+    vehicle.origin = vehicle.origin + np.array([moved_m, 0.0, 0.0])  # its GPS_GLOBAL_ORIGIN is lost
     vehicle.t_us += STEP_US
     vehicle.true = vehicle.true + EAST * STEP_US * 1e-6
     vehicle.frame.place(vehicle.t_us, vehicle.true - vehicle.origin, EAST, True, reset=True)
