@@ -131,7 +131,7 @@ class LineAgent:
         for_all = utc_us >= self._due_us
         if for_all:
             self._due_us = utc_us + _FAR_US
-        reach = self.far_peers.reach(commitments.trajectories, away_m=0.0, speed_m_s=0.0)
+        reach = self.far_peers.reach(commitments.trajectories, away_m=0.0, speed_m_s=0.0, stops_m=0.0)
         self.far_peers.published(reach, utc_us, for_all=for_all)
         heard = {agent: (message.sent_utc_us, utc_us) for agent, message in self.known.items()}
         message = builders.trajectory_message(

@@ -17,6 +17,7 @@ from swarmctl.core.trajectory_message import Exclusions, Proposal, Reach, Trajec
 _NOWHERE = Reach(speed_m_s=0.0, stretch_m=0.0)
 _ANSWERS_US = 35_000  # acknowledgements alone wait for others so long
 _HEARD_US = 75_000  # how often it is said what was heard
+_HALVED_US = 250_000  # at most between messages to all, so that a lease lasts longer than one of them that is lost
 _UNTOLD_M = 0.2  # by which the stretch may grow before all are told
 
 
@@ -112,7 +113,7 @@ class CommitmentPublisher:
     def _heard(
         self, utc_us: int, attentive: Sequence[int], reach: Reach, *, for_all: bool
     ) -> Mapping[int, tuple[int, int]]:
-        """Return what the message says about what was heard: of half of those that are far in turns."""
+        """Return what the message says about what was heard: of the far half in turns, or all if it is rare."""
         if not self._far_us:
             return self._peers.heard(attentive)
         if not for_all and utc_us < self._heard_us + _HEARD_US:
@@ -120,7 +121,8 @@ class CommitmentPublisher:
         self._heard_us = utc_us
         if for_all:
             self._half = 1 - self._half
-            far = [agent for agent in self._peers.newest if agent in reach.far and agent % 2 == self._half]
+            is_rare = self._far_us > _HALVED_US
+            far = [a for a in self._peers.newest if a in reach.far and (is_rare or a % 2 == self._half)]
             attentive = list({*attentive, *far})
         return self._peers.heard(attentive)
 

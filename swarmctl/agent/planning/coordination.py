@@ -92,6 +92,7 @@ class Coordination:
         self._spared: frozenset[int] = frozenset()  # peers whose acknowledgement of the proposal is not required
         self._hears = self._peers  # every message of these
         self._others_m_s = 0.0  # speed at which somebody else flies the vehicle
+        self._brake_m_s2 = params.brake_m_s2
         self._is_committed = False
         self._tube_m = separation.budget.tube_m
         self._tube = Tube(self._tube_m)
@@ -212,7 +213,9 @@ class Coordination:
         proposal, peers = self._commitments.proposal, self._peer_trajectories
         self._spared = frozenset()
         if proposal is not None:
-            self._spared = self._far_peers.spared(proposal.trajectory, peers.newest, peers.confirmed_us, utc_us)
+            self._spared = self._far_peers.spared(
+                proposal.trajectory, peers.newest, peers.confirmed_us, utc_us, self._membership.excluded
+            )
             self._ask_far(proposal)
 
     def _still_spared(self, utc_us: int) -> frozenset[int]:
@@ -227,7 +230,7 @@ class Coordination:
 
     def _ask_far(self, proposal: Proposal) -> None:
         """Mark a proposal whose acknowledgement is required of a far peer."""
-        if not proposal.asks_far and not self._peers - self._far_peers.near <= self._spared:
+        if not proposal.asks_far and not self._required_peers() - self._far_peers.near <= self._spared:
             self._commitments.proposal = replace(proposal, asks_far=True)
 
     def _relied_on(self, utc_us: int, known: Mapping[int, TrajectoryMessage], required: Set[int]) -> Set[int]:
@@ -294,7 +297,10 @@ class Coordination:
             tube_m=max(self._tube.radius_m, min(MAX_MARGIN_M, self._error_m + unsure_m)),
             exclusions=exclusions,
             reach=self._far_peers.reach(
-                commitments.trajectories, away_m=commitments.late_m(utc_us), speed_m_s=self._others_m_s
+                commitments.trajectories,
+                away_m=commitments.late_m(utc_us),
+                speed_m_s=self._others_m_s,
+                stops_m=0.5 * self._others_m_s**2 / self._brake_m_s2,
             ),
             refused=self._ended | exclusions.promised,
         )

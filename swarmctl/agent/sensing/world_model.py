@@ -252,8 +252,12 @@ class WorldModel:
         self._ended = None
 
     def life_sign(self, agent: int, utc_us: int) -> str:
-        """Return what speaks against an operator's word that a peer has ended: it was just heard; or ""."""
-        age_us = utc_us - self._status_us.get(agent, utc_us - _SILENT_US)
+        """Return what speaks against an operator's word that a peer has ended: it was just heard; or "".
+
+        Of a peer out of reach only paths are heard.
+        """
+        heard_us = (self._status_us.get(agent), self.paths.newest_utc_us(agent))
+        age_us = max(0, utc_us - max([at_us for at_us in heard_us if at_us is not None], default=utc_us - _SILENT_US))
         if self.has_ended(agent) or age_us >= _SILENT_US:
             return ""
         return f"{agent_name(agent)} was heard {age_us * 1e-6:.1f} s ago, so it has not ended"

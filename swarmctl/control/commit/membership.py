@@ -2,7 +2,8 @@
 
 Silence proves nothing: a silent peer may have died, or be frozen, or be cut off and think the same of this agent. If
 both excluded each other, both would commit without the other's acknowledgement. So a silent peer stays a participant,
-at rest at the end of its last commitment, which it cannot leave without this agent's acknowledgement, until
+at rest at the end of its last commitment, which it cannot leave without this agent's acknowledgement (one that has
+declared this agent far can for as long as its lease lasts, see `swarmctl.control.commit.reach`), until
 
 - somebody who knows vouches for the end of its agent (the launcher that has seen its process end, or the operator), or
   its own vehicle has been heard landed and disarmed; or

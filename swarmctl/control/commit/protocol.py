@@ -40,8 +40,8 @@ The proof rests on these assumptions, each of which is watched in flight:
   corrected (`swarmctl.bus.peer_clocks`), and the error that is left, a round trip at most, goes with every trajectory
   received. From one that is flown at speed v by a clock known to e, rules 2 and 4 keep v e more, and so does the safety
   filter (`Trajectory.spread_m`): of each pair of trajectories that the proof speaks of, one agent has checked the other
-  one's, with room for all that it does not know of the other's clock. Beyond `agent.commit.clock_error_max_s` nothing
-  new is proposed.
+  one's, with room for all that it does not know of the other's clock. Beyond `agent.commit.clock_error_max_s` of a peer
+  that is not far nothing new is proposed.
 - Vehicles stay in their tubes: each may miss what it is committed to by half of the committed distance beyond touching
   bodies, what its estimator has lost of its accuracy included. `swarmctl.control.commit.tube` watches it; the event
   `tracking_violation` reports who leaves its tube, and `commitments` at the end the worst error of the flight. A

@@ -21,7 +21,11 @@ nothing newer. For the others, and for b, B did without A, by condition 1 for `L
 them it was no faster than the v_B that m states, and b is no longer than its L_B. So b lies in the ball, and a outside.
 
 An excluded peer owes nothing as long as its newest message known does not declare the agent far: it commits to nothing
-without the agent then. Otherwise proposals keep clear of its ball, which has ceased to grow.
+without the agent then. Otherwise proposals keep clear of its ball. Once its lease has ended, that is all: it can't
+commit without the agent any more, so that the agent is the later one, and needs conditions 1 and 2 no longer.
+
+What is committed to unasked, to evade or where a pilot gives the vehicle back, leaves the ball until it is heard: the
+next message of the agent, to all, states its speed and stretch. Until then a far peer may commit to what meets it.
 """
 
 from __future__ import annotations
@@ -117,6 +121,7 @@ class FarPeers:
         messages: Mapping[int, TrajectoryMessage],
         confirmed_us: Mapping[int, int],
         utc_us: int,
+        excluded: Collection[int] = (),
     ) -> frozenset[int]:
         """Return the peers whose acknowledgement of a trajectory is not required, by conditions 1 to 3.
 
@@ -125,11 +130,14 @@ class FarPeers:
             messages: newest ones of peers.
             confirmed_us: by peer, stamp of the newest own message that it has said to have heard.
             utc_us: now.
+            excluded: peers that a majority has excluded; condition 3 alone holds for them after their lease.
         """
-        if not self.enabled or not self._is_within(self._extent(trajectory)):
+        if not self.enabled:
             return _NOBODY
-        leased = [agent for agent in self._told if self._is_leased(agent, confirmed_us.get(agent, 0), utc_us)]
-        return self._checked_clear(leased, trajectory, messages, utc_us)
+        looked_at = {agent for agent in excluded if agent in messages and self._is_over(agent, messages[agent], utc_us)}
+        if self._is_within(self._extent(trajectory)):
+            looked_at.update(a for a in self._told if self._is_leased(a, confirmed_us.get(a, 0), utc_us))
+        return self._checked_clear(sorted(looked_at), trajectory, messages, utc_us)
 
     def still_spared(
         self, spared: frozenset[int], trajectory: Trajectory, messages: Mapping[int, TrajectoryMessage], utc_us: int
@@ -167,13 +175,13 @@ class FarPeers:
         are_clear = np.einsum("akc,akc->ak", ways, ways).min(axis=1) > kept_m * kept_m
         return frozenset(agent for agent, is_clear in zip(agents, are_clear.tolist(), strict=True) if is_clear)
 
-    def reach(self, own: Collection[Trajectory], *, away_m: float, speed_m_s: float) -> Reach:
+    def reach(self, own: Collection[Trajectory], *, away_m: float, speed_m_s: float, stops_m: float) -> Reach:
         """Return what a message states.
 
         Args:
             own: committed and proposed trajectories.
             away_m: how far the vehicle is from where it was committed to be.
-            speed_m_s: how fast it is flown by others.
+            speed_m_s, stops_m: how fast it is flown by others, and the way on which it stops from there.
         """
         if not self.enabled:
             return ANYWHERE
@@ -181,7 +189,7 @@ class FarPeers:
         return Reach(
             far=self._peers - self.near,
             speed_m_s=max([self._speed_m_s, speed_m_s, *(extent.fastest_m_s for extent in immodest)]),
-            stretch_m=away_m + max([self._stretch_m, *(extent.length_m for extent in immodest)]),
+            stretch_m=away_m + max([self._stretch_m, stops_m, *(extent.length_m for extent in immodest)]),
         )
 
     def published(self, reach: Reach, sent_utc_us: int, *, for_all: bool) -> None:
@@ -193,6 +201,11 @@ class FarPeers:
 
     def _is_leased(self, agent: int, heard_us: int, utc_us: int) -> bool:
         return agent not in self.near and self._told[agent] <= heard_us <= utc_us <= heard_us + LEASE_US
+
+    def _is_over(self, agent: int, message: TrajectoryMessage, utc_us: int) -> bool:
+        """Return whether a peer can't do without this agent any more, by the lease of its newest message known."""
+        place = self._place(agent, message)
+        return utc_us > place.sent_utc_us + LEASE_US + message.committed.clock_error_us
 
     def _is_within(self, extent: _Extent) -> bool:
         fastest_m_s, length_m = extent

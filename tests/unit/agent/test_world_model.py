@@ -275,6 +275,21 @@ def test_whose_end_is_vouched_for_has_ended_until_another_process_is_heard() -> 
     assert not bench.world_model.has_ended(1)
 
 
+def test_a_path_that_was_just_heard_speaks_against_the_word_that_a_peer_has_ended() -> None:
+    bench = Bench()
+    bench.say_path()
+    bench.say_status(phase=int(Phase.TRACK))
+    bench.tick()
+    for _ in range(150):  # out of reach, where statuses are not heard
+        bench.seq += 1
+        bench.say_path()
+        bench.tick()
+    assert "was heard" in bench.world_model.life_sign(1, bench.clock.utc_us())
+    for _ in range(150):
+        bench.tick()
+    assert bench.world_model.life_sign(1, bench.clock.utc_us()) == ""
+
+
 def test_a_silent_peer_for_whom_nobody_vouches_has_not_ended() -> None:
     bench = Bench()
     bench.say_path()

@@ -56,7 +56,7 @@ class Scene:
         return 1 not in self.far_peers.near
 
     def stated(self) -> Reach:
-        return self.far_peers.reach([at(0.0)], away_m=0.0, speed_m_s=0.0)
+        return self.far_peers.reach([at(0.0)], away_m=0.0, speed_m_s=0.0, stops_m=0.0)
 
     def spares(self, trajectory: Trajectory, later_us: int = 0) -> bool:
         return 1 in self.far_peers.spared(trajectory, self.messages, self.confirmed_us, NOW_US + later_us)
@@ -73,7 +73,7 @@ def test_who_is_beyond_what_both_can_reach_is_far() -> None:
 def test_nobody_is_far_without_far_messages_and_of_whom_nothing_is_known() -> None:
     off = FarPeers([1], speed_m_s=0.0, stretch_m=0.0, apart_m=APART_M, ahead_us=lambda _: 0)
     off.update([at(0.0)], Scene(1000.0).messages, NOW_US)
-    assert off.near == {1} and off.reach([at(0.0)], away_m=0.0, speed_m_s=0.0) == ANYWHERE
+    assert off.near == {1} and off.reach([at(0.0)], away_m=0.0, speed_m_s=0.0, stops_m=0.0) == ANYWHERE
     scene = Scene(1000.0)
     scene.far_peers.update([at(0.0)], {}, NOW_US + 100_000)
     assert scene.far_peers.near == {1}
@@ -136,12 +136,29 @@ def test_an_immodest_proposal_spares_nobody_and_messages_state_it(immodest: Traj
     scene = Scene(100.0)
     assert scene.spares(moving(0.0, 2.0, 2.9))
     assert not scene.spares(immodest)
-    stated = scene.far_peers.reach([at(0.0), immodest], away_m=0.0, speed_m_s=0.0)
+    stated = scene.far_peers.reach([at(0.0), immodest], away_m=0.0, speed_m_s=0.0, stops_m=0.0)
     assert stated.speed_m_s > SPEED_M_S or stated.stretch_m > STRETCH_M
 
 
+def test_of_an_excluded_peer_distance_alone_counts_once_it_can_not_do_without_the_agent_any_more() -> None:
+    immodest, later_us = moving(0.0, 2.1, 4.0), LEASE_US + 100_000
+
+    def spares(north_m: float, after_us: int) -> bool:
+        scene = Scene(north_m)
+        return 1 in scene.far_peers.spared(immodest, scene.messages, {}, NOW_US + after_us, {1})
+
+    assert spares(100.0, later_us)
+    assert not spares(100.0, LEASE_US - 100_000), "it may still commit without the agent"
+    assert not spares(12.0, later_us), "within what it may have committed to"
+
+
+def test_messages_state_on_which_way_a_vehicle_stops_that_somebody_else_flies() -> None:
+    stated = Scene(100.0).far_peers.reach([at(0.0)], away_m=0.5, speed_m_s=8.0, stops_m=21.0)
+    assert (stated.speed_m_s, stated.stretch_m) == (8.0, 21.5)
+
+
 def test_messages_state_what_others_fly_and_how_far_the_vehicle_is_off() -> None:
-    stated = Scene(100.0).far_peers.reach([at(0.0)], away_m=0.7, speed_m_s=5.0)
+    stated = Scene(100.0).far_peers.reach([at(0.0)], away_m=0.7, speed_m_s=5.0, stops_m=0.0)
     assert (stated.speed_m_s, stated.stretch_m) == (5.0, STRETCH_M + 0.7)
 
 
