@@ -33,6 +33,7 @@ from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows
 from swarmctl.core.types import Plan
+from swarmctl.errors import ConfigError
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
 from swarmctl.mavlink.transport import pipe_pair
@@ -127,7 +128,8 @@ class Lockstep:
         self._tick_us = round(1e6 / config.agent.rate_hz)
         self._physics_us = round(1e6 / config.sitl.physics_hz)
         if self._tick_us % self._physics_us:
-            raise ValueError(f"sitl.physics_hz: {config.sitl.physics_hz} must be a multiple of agent.rate_hz")
+            told = f"sitl.physics_hz = {config.sitl.physics_hz:g}: in lockstep a multiple of agent.rate_hz"
+            raise ConfigError(config.name, [f"{told} = {config.agent.rate_hz:g}; set one to suit the other"])
         latency_us = round(config.sitl.link_latency_ms * 1000)
         self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]  # (agent's, vehicle's) ends
         self._keys = read_keys(config.mavlink.signing_keys, agents)

@@ -22,19 +22,19 @@ from swarmctl.config import Config, dump, load
 from swarmctl.configuration.config_warnings import warning_lines
 from swarmctl.configuration.view import viewed_flight
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
-from swarmctl.files import replace_bytes, replace_text, write_each
+from swarmctl.files import replace_bytes, write_each
 from swarmctl.ops.flight.summary import summary_lines, unwritten_line, violation_lines
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.run_files import load_run, read_plans
-from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run
+from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, write_config
 from swarmctl.telemetry.view.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
 from swarmctl.wall_clock import utc_us
 
 
 def simulate(config: Config, directory: Path) -> int:
     """Fly `config` in lockstep into the run folder `directory` and return the exit code."""
-    replace_text(directory / "config.toml", dump(config))
+    write_config(directory, dump(config))
     flight = Lockstep(config, directory)
     stop = StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP, raise_at=2)  # the first request lands
     began_s = time.perf_counter()

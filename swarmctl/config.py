@@ -197,6 +197,7 @@ class Config(Params):
             duration_s=self.mission.duration_s,
             downwash=self.separation.downwash,
             volume=self.volume.flight_volume(),
+            ground_z_m=self.sitl.ground_z_m if self.sitl.enabled else None,
             goals_ned_m=self.goals_ned_m(),
         )
 
@@ -352,7 +353,7 @@ def _infeasible(config: Config) -> Iterator[str]:
         apart_m=0.0 if close else separation.radius_m,  # what follows from starts is not said again
         downwash=separation.downwash,
         ground_z_m=config.sitl.ground_z_m if config.sitl.enabled else None,
-        volume=config.volume.flight_volume(),
+        volume=None if any(config.volume.problems()) else config.volume.flight_volume(),
         fence=config.geofence.area(),
     )
     try:

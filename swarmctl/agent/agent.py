@@ -31,7 +31,6 @@ from swarmctl.agent.mission.start_conditions import StartConditions
 from swarmctl.agent.planning.planner import Planner
 from swarmctl.agent.ports import Ports
 from swarmctl.agent.sensing.own_state import OwnState
-from swarmctl.agent.sensing.world_model import FLOWN_BY_AGENT
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.sharing.path_publisher import PathPublisher
 from swarmctl.agent.tick_results import ControlOutput, PlanningResult
@@ -44,6 +43,7 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import (
+    FLOWN_BY_AGENT,
     NO_TIMES,
     AttitudeSetpoint,
     FlightMode,

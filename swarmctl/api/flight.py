@@ -6,6 +6,7 @@ priority and a simulator that the bridge never imports. So a script flies exactl
 
 from __future__ import annotations
 
+import operator
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -20,13 +21,13 @@ from swarmctl.config import Config, dump
 from swarmctl.core.operator_verbs import FAR, GOTO, MISSION, POINT, SPEED, YAW, Order, order_problem
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.errors import ConfigError, MissionError, StartError
-from swarmctl.files import read_file, replace_text
+from swarmctl.files import read_file
 from swarmctl.ops.orders.mission_file import set_mission
 from swarmctl.ops.orders.operator import read_statuses
 from swarmctl.ops.orders.order_delivery import Reply, deliver
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
 from swarmctl.telemetry.recording.run_files import CONFIG
-from swarmctl.telemetry.recording.run_folder import create_run_folder
+from swarmctl.telemetry.recording.run_folder import create_run_folder, write_config
 from swarmctl.wall_clock import utc_us
 
 _READY_S = 120.0  # for the launch to have started every process
@@ -78,7 +79,7 @@ def launch(config: Config | None = None, folder: str | Path | None = None, *, vi
 def _new_folder(config: Config, folder: str | Path | None) -> Path:
     """Return a new run folder that holds the configuration."""
     directory = create_run_folder(None if folder is None else Path(folder), config.name, utc_us())
-    replace_text(directory / CONFIG, dump(config))
+    write_config(directory, dump(config))
     return directory.resolve()
 
 
@@ -259,8 +260,20 @@ class Swarm:
 
 
 def _numbers(agents: Agents) -> list[int]:
-    """Return the numbers of the agents asked; none: all."""
-    return [agents] if isinstance(agents, int) else list(agents or ())
+    """Return the numbers of the agents asked; none: all.
+
+    Raises:
+        ConfigError: no agent is named, or something that is no number of one.
+    """
+    if agents is None:
+        return []
+    named = list(agents) if isinstance(agents, Iterable) else [agents]
+    numbers = [operator.index(one) for one in named if hasattr(one, "__index__") and not isinstance(one, bool)]
+    if not named:
+        raise ConfigError("agents", ["nobody is named; leave it out for all"])
+    if len(numbers) < len(named):
+        raise ConfigError("agents", [f"{agents!r}: expected numbers of agents, as 0 or [0, 2]"])
+    return numbers
 
 
 def _refuse_problems(replies: Sequence[Reply]) -> None:

@@ -31,6 +31,14 @@ def warning_lines(config: Config) -> list[str]:
     return [f"warning: {text}" for text in config_warnings(config)]
 
 
+def unplayed(config: Config) -> Iterator[str]:
+    """Yield what a launch does not do to its links, since only flights in lockstep play it."""
+    played = {f"bus.{name}": getattr(config.bus, name) for name in ("delay_ms", "loss_01", "burst_01", "jitter_ms")}
+    played["sitl.link_latency_ms"] = config.sitl.link_latency_ms
+    if asked := [f"{key} = {value:g}" for key, value in played.items() if value]:
+        yield f"{', '.join(asked)}: of lockstep only (`swarmctl simulate`); a launch flies with its links as they are"
+
+
 def _begin_elsewhere(config: Config) -> Iterator[str]:
     """Yield whose own reference begins away from where the agent waits, so that it has to catch up with it.
 

@@ -72,6 +72,9 @@ class Mode(enum.IntEnum):
     STATE_STALE = 8  # own state too old: nothing is sent, the autopilot's failsafe acts
 
 
+FLOWN_BY_AGENT = frozenset((Mode.TRACKING, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))  # modes with setpoints of its own
+
+
 class ControlMode(enum.IntEnum):
     """What an operator is shown that a vehicle is doing, as `control.phases.control_mode` decides it.
 

@@ -10,8 +10,9 @@ import pytest
 from swarmctl.agent.planning.commitment_publisher import CommitmentPublisher
 from swarmctl.agent.sharing.interest import Interest
 from swarmctl.bus import topics
+from swarmctl.bus.bus import agent_name
 from swarmctl.control.commit.reach import FarPeers
-from tests.closed_loop.conftest import Flight, fly_now, mission_t_s
+from tests.closed_loop.conftest import COARSE, Flight, fly_now, mission_t_s
 from tests.closed_loop.test_interest import to_goals
 
 COMMITTED_M = 0.85
@@ -105,3 +106,28 @@ def test_without_a_bus_even_those_that_are_far_stop() -> None:
 def test_negative_control_without_the_lease_they_fly_into_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FarPeers, "_is_leased", lambda self, agent, *_: agent not in self.near)
     assert in_the_dark().separation_m() < 0.5
+
+
+def gone_on_m() -> float:
+    """Cut off the last of four, of which two are 40 m away and fly away; how far those come in 16 s of mission [m]."""
+    starts = [[x, y, -3.0] for x in (0.0, 40.0) for y in (-3.0, 3.0)]
+    goals = [[-45.0, -3.0, -3.0], [-45.0, 3.0, -3.0], [40.0, -6.0, -3.0], [40.0, 6.0, -3.0]]
+    others = frozenset(map(agent_name, range(3)))
+    flight = fly_now(
+        *(*FAR, *COARSE, "sitl.start=air", "swarm.agents=4", "mission.kind=goto", "mission.duration_s=60"),
+        f"start.positions_ned_m={json.dumps(starts)}",
+        f"mission.goto.goals_ned_m={json.dumps(goals)}",
+        at={3.0: lambda running: running.hub.split([frozenset({agent_name(3)}), others])},
+        until=lambda running: mission_t_s(running) > 16.0,
+    )
+    assert flight.separation_m() >= COMMITTED_M
+    return -float(max(flight.ticks(agent)["pos_ned_m"][-1][0] for agent in (0, 1)))
+
+
+def test_who_is_far_from_an_agent_that_a_majority_has_excluded_flies_on() -> None:
+    assert gone_on_m() > 8.0
+
+
+def test_negative_control_who_asks_the_excluded_for_what_it_has_heard_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FarPeers, "_is_over", lambda *_: False)
+    assert gone_on_m() < 2.0

@@ -83,6 +83,7 @@ def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
         ("start.spacing_m=0.5", ("agents 0 and 1", "0.50 m apart", "start.spacing_m")),
         ("geofence.corners_ne_m=[[9.0, 9.0], [9.0, -9.0]]", ("geofence.corners_ne_m", "2 corners", "3 or more")),
         ("volume.floor_z_m=1", ("volume.corners_ne_m: none", "a floor or a ceiling")),
+        ("volume.corners_ne_m=[[-9,-9],[9,-9],[9,9],[-9,9]]", ("volume.floor_z_m: missing", "floor and ceiling")),
         (
             "geofence.corners_ne_m=[[0.5, 9.0], [0.5, -9.0], [-9.0, 0.0]]",
             ("geofence.corners_ne_m", "agents [2]", "outside"),

@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 from rich.console import Console
 from rich.table import Table
 
+from sitl.studies.arguments import count, seed
 from sitl.studies.campaign.conditions.disturbances import DISTURBANCES, NONE
 from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS
 from sitl.studies.campaign.conditions.scenarios import AIRFRAMES, SCENARIOS
@@ -166,10 +167,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--airframe", metavar="NAME,..", type=_names(AIRFRAMES), default=["own"], help=", ".join(AIRFRAMES))
     add("--disturbance", metavar="NAME[:STRENGTH],..", type=_disturbances, default=[NONE], help="as listed below")
     add("--set", metavar="KEY=VALUE", dest="sets", action="append", default=[], help="of the configuration, any number")
-    add("--trials", metavar="N", type=int, default=20, help="seeds of every cell, default %(default)s")
-    add("--first-seed", metavar="K", type=int, default=1)
+    add("--trials", metavar="N", type=count, default=20, help="seeds of every cell, default %(default)s")
+    add("--first-seed", metavar="K", type=seed, default=1)
     add("--out", metavar="DIR", type=Path, default=Path("runs/campaign"), help="default %(default)s")
-    add("--jobs", metavar="N", type=int, default=os.cpu_count() or 1, help="processes, default %(default)s")
+    add("--jobs", metavar="N", type=count, default=os.cpu_count() or 1, help="processes, default %(default)s")
     add("--dask", metavar="HOST:PORT", help="fly on the workers of this scheduler instead")
     add("--mix", action="store_true", help="go on in a folder whose rows were flown by other sources")
     add("--quick", action="store_true", help="the subset that is tested with every change; leaves the axes above out")

@@ -12,11 +12,11 @@ import sys
 from functools import partial
 from pathlib import Path
 
+from sitl.studies.arguments import count, seed
 from swarmctl.errors import exit_code_of
 
 _WHAT = """Fly every combination of values in lockstep, faster than real time, on all processors. The same call again
 goes on where it stopped. Rows go to OUT/rows.parquet as they come in; OUT/report.html has the table and charts."""
-_MOST_SEED = 2**31 - 1
 _SET_HELP = "values of a key, separated by commas outside of brackets; repeatable"
 
 
@@ -43,23 +43,11 @@ def _parser() -> argparse.ArgumentParser:
     add("config", nargs="?", type=Path, metavar="CONFIG", help="TOML file; default: the circle of the thesis")
     add("--set", metavar="KEY=V,V", dest="sets", action="append", default=[], help=_SET_HELP)
     add("--duration", metavar="S", help="duration of every mission [s]; default: that of the configuration")
-    add("--seeds", metavar="N", type=_count, default=1, help="seeds of every combination; default %(default)s")
-    add("--seed", metavar="K", type=_seed, help="the first of them; default: that of the configuration")
-    add("--jobs", metavar="N", type=_count, default=os.cpu_count() or 1, help="processes; default %(default)s")
+    add("--seeds", metavar="N", type=count, default=1, help="seeds of every combination; default %(default)s")
+    add("--seed", metavar="K", type=seed, help="the first of them; default: that of the configuration")
+    add("--jobs", metavar="N", type=count, default=os.cpu_count() or 1, help="processes; default %(default)s")
     add("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="folder; default %(default)s")
     return parser
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 10_000:
-        raise argparse.ArgumentTypeError(f"{text!r}: allowed: 1 to 10000")
-    return int(text)
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal() or int(text) > _MOST_SEED:
-        raise argparse.ArgumentTypeError(f"{text!r}: allowed: 0 to {_MOST_SEED}")
-    return int(text)
 
 
 if __name__ == "__main__":

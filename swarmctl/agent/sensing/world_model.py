@@ -30,7 +30,7 @@ from swarmctl.control.estimation.constant_velocity import CREEP_M_S
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase
+from swarmctl.core.types import FLOWN_BY_AGENT, Array, FlightMode, Landed, Phase
 
 _COMPANY_US = 10_000_000  # a peer whose last status is older has left
 _SILENT_US = 2_000_000  # ten statuses; who is heard within it has not ended
@@ -39,7 +39,6 @@ _STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
 _DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
 _HOLDS = frozenset((FlightMode.HOLD,))
 _MOVES = frozenset(FlightMode) - _HOLDS
-FLOWN_BY_AGENT = frozenset((Mode.TRACKING, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
 
 class WorldModel:

@@ -26,9 +26,8 @@ from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
 from swarmctl.bus.topics import ENDED, OBSTACLES, OPERATOR, STATUS, TICK, Topic
 from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, socket_file
 from swarmctl.config import Config, dump
-from swarmctl.configuration.config_warnings import warning_lines
+from swarmctl.configuration.config_warnings import unplayed, warning_lines
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.files import replace_text
 from swarmctl.ops.flight.summary import sum_up
 from swarmctl.ops.orders.operator import list_keepers
 from swarmctl.ops.preflight import LOOPBACK, ReservedPorts, inspect
@@ -151,11 +150,11 @@ def started(config: Config, options: LaunchOptions, part: SwarmPart) -> Iterator
 
 
 def _run_folder(config: Config, options: LaunchOptions) -> Path:
-    from swarmctl.telemetry.recording.run_folder import create_run_folder  # heavy
+    from swarmctl.telemetry.recording.run_folder import create_run_folder, write_config  # heavy
 
     directory = create_run_folder(options.run_dir, config.name, utc_us()).resolve()
     try:
-        replace_text(directory / "config.toml", dump(config))
+        write_config(directory, dump(config))
     except OSError as error:
         raise StartError(f"{directory}: can't be written: {error}. Choose another with --run-dir") from error
     return directory
@@ -204,7 +203,8 @@ class Launcher(Services):
         for command in agent_commands(config, context, reserved.sockets, reserved.vehicle_sockets):
             self._spawn(command)
         self.announce("")
-        for line in (*_introduction(config, context, reserved), *warning_lines(config)):
+        doubts = [*warning_lines(config), *(f"warning: {text}" for text in unplayed(config))]
+        for line in (*_introduction(config, context, reserved), *doubts):
             self.display.print_line(line)
         realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
         self.log.write(

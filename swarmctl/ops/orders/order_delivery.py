@@ -156,7 +156,14 @@ def addressed(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> lis
         ConfigError: there is no such agent, or it does not obey this computer.
         StartError: there is nobody to be told.
     """
-    named = [*agents, *(int(number) for name, number in order.arguments.items() if name == PEER)]
+    peer = order.arguments.get(PEER)
+    if peer is not None and not float(peer).is_integer():
+        raise ConfigError(order.verb, [f"--peer {peer:g}: expected the number of an agent"])
+    if peer in agents:
+        raise ConfigError(
+            order.verb, [f"agent {peer:g} is not asked whether it has ended itself; name others, or none"]
+        )
+    named = [*agents, *([] if peer is None else [int(peer)])]
     unknown = [agent for agent in dict.fromkeys(named) if not 0 <= agent < launch.agents]
     if unknown:
         known = "agent 0 only" if launch.agents == 1 else f"agents 0 to {launch.agents - 1}"
@@ -164,7 +171,7 @@ def addressed(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> lis
     obeying = obeying_agents(launch)
     if deaf := [agent for agent in dict.fromkeys(agents) if agent not in obeying]:
         raise ConfigError(order.verb, [f"agent {agent} does not obey: {no_operator(launch)}" for agent in deaf])
-    asked = sorted(set(agents)) or [i for i in obeying if i != order.arguments.get(PEER)]
+    asked = sorted(set(agents)) or [i for i in obeying if i != peer]
     if not asked:
         raise StartError(f"{order.verb}: {launch.run} has no other agent that could be told")
     return asked

@@ -50,6 +50,8 @@ def check_and_identify(config: Config, options: IdentifyOptions) -> int:
     """
     if options.write is not None and options.write.exists():
         raise StartError(f"{options.write}: exists already. Choose a new file with --write")
+    if options.write is not None and not options.write.absolute().parent.is_dir():
+        raise StartError(f"{options.write}: its folder does not exist. Choose another file with --write")
     code = check(config, replace(options.check, to_fly=True))
     if code != EXIT_OK:
         print("not flown: something is to fix first")

@@ -20,6 +20,7 @@ from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
 from swarmctl.telemetry.evaluation.arrivals import reached_goals
+from swarmctl.telemetry.evaluation.crashes import crashes
 from swarmctl.telemetry.evaluation.reception import refused_peers
 from swarmctl.telemetry.evaluation.run_counts import (
     commitment_counts,
@@ -70,6 +71,7 @@ class Rules:
     mode: Literal["realtime", "lockstep"] = "realtime"
     duration_s: float | None = None  # mission time that a completed run must have tracked
     volume: FlightVolume | None = None  # that nobody may leave
+    ground_z_m: float | None = None  # down coordinate of the simulator's ground
     goals_ned_m: tuple[tuple[float, ...] | None, ...] = ()  # (3,) of every agent; None: its mission has none
     downwash: float = 1.0  # heights are divided by this in `scaled_min_m`, which is reported but not judged
 
@@ -117,7 +119,10 @@ def evaluate(
     refused = _shorten(list(refused_peers(run.events)))
     configured = dict(enumerate(rules.goals_ned_m))
     goals_ned_m = {agent: configured.get(agent) for agent in here}
-    violations = [*problems, *apart, *clear, *inside, *unseen, *punctual, *refused, *_not_a_number(run.truth)]
+    ground_z_m = rules.ground_z_m if len(run.truth) else None
+    crashed = _shorten(list(crashes(run.ticks, tracks, ground_z_m, clock.at_s)))
+    violations = [*problems, *crashed, *apart, *clear, *inside, *unseen, *punctual, *refused]
+    violations += _not_a_number(run.truth)
     if outcome == "completed":
         violations += _cut_short(tracked_s, rules, run.events)
     summary = {

@@ -37,6 +37,8 @@ from swarmctl.telemetry.report.comparison import JudgedRun, write_comparison
 from swarmctl.telemetry.report.run_report import FIGURES, REPORT, write_figures, write_report
 
 _LAUNCHES_PER_SECOND = 1000
+_STUDY = "rows.parquet"  # of a campaign or a sweep
+_TAKEN = frozenset((EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING, REPORT, _STUDY))
 
 
 def create_run_folder(
@@ -71,17 +73,26 @@ def create_run_folder(
 
 def _claim(base: Path) -> Path:
     base.mkdir(parents=True, exist_ok=True)
-    taken = sorted(
-        path.name
-        for path in base.iterdir()
-        if path.name in (EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING) or AGENT_FILE.match(path.name)
-    )
+    taken = sorted(path.name for path in base.iterdir() if path.name in _TAKEN or AGENT_FILE.match(path.name))
     links = sorted(path.name for path in base.iterdir() if path.is_symlink())
     if links:
         raise ConfigError(f"--run-dir {base}", [f"holds a symbolic link ({links[0]}). Choose a new folder or empty it"])
     if taken:
         raise ConfigError(f"--run-dir {base}", [f"holds a run already ({taken[0]}). Choose a new folder or empty it"])
     return base
+
+
+def write_config(directory: Path, text: str) -> None:
+    """Write the resolved configuration of a new run into its folder.
+
+    Raises:
+        ConfigError: another configuration is there, which may be the user's own.
+        OSError: it can't be written.
+    """
+    path = directory / CONFIG
+    if path.exists() and path.read_text(encoding="utf-8", errors="replace") != text:
+        raise ConfigError(f"--run-dir {directory}", [f"holds another {CONFIG}. Choose a new folder or move that file"])
+    replace_text(path, text)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,6 +148,8 @@ def report_run(directory: Path, rules: Rules) -> Path:
         ConfigError: a file in the folder has not the expected content.
         StartError: the folder can't be written to, or the run is not finished and somebody still records it.
     """
+    if (directory / _STUDY).exists():
+        raise ConfigError(str(directory), [f"holds a campaign or a sweep, whose page is {REPORT}, and no run"])
     if read_summary(directory) is None:
         _refuse_recorded(directory)
         finished = finish_run(

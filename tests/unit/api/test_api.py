@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 
 import swarmctl
+from swarmctl.api.flight import _numbers
 from swarmctl.api.flight_process import FlightProcess
 from swarmctl.config import Config
 from swarmctl.core.types import Phase
+from swarmctl.errors import ConfigError
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
 from tests.unit.ops.test_cli import HEAVY
 from tests.unit.telemetry.test_hostile_run_folder import REFUSED
@@ -163,3 +165,17 @@ def test_waiting_has_an_end(tmp_path: Path) -> None:
     with swarm:
         pass
     assert not swarm.is_flying, "the end of the block has asked it to land, and waited"
+
+
+@pytest.mark.parametrize(
+    ("agents", "numbers"),
+    [(None, []), (1, [1]), ([2, 0], [2, 0]), (np.int64(0), [0]), (np.array([0, 2]), [0, 2]), (range(2), [0, 1])],
+)
+def test_agents_are_named_by_any_whole_numbers(agents: Any, numbers: list[int]) -> None:
+    assert _numbers(agents) == numbers
+
+
+@pytest.mark.parametrize("agents", [[], (), np.array([]), True, [True], 1.0, [1.5], "1", [[0]]])
+def test_what_names_no_agent_is_refused_and_never_all(agents: Any) -> None:
+    with pytest.raises(ConfigError, match="agents: "):
+        _numbers(agents)

@@ -10,7 +10,7 @@ import pytest
 
 import swarmctl
 from swarmctl.config import dump, load, load_mission
-from swarmctl.configuration.config_warnings import config_warnings, warning_lines
+from swarmctl.configuration.config_warnings import config_warnings, unplayed, warning_lines
 from swarmctl.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]
@@ -116,3 +116,9 @@ def test_a_script_is_warned() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         swarmctl.load()
+
+
+def test_a_launch_says_what_only_lockstep_plays() -> None:
+    assert list(unplayed(load(None))) == []
+    (said,) = unplayed(load(None, ["bus.loss_01=0.5", "sitl.link_latency_ms=100"]))
+    assert said.startswith("bus.loss_01 = 0.5, sitl.link_latency_ms = 100: of lockstep only")

@@ -10,6 +10,7 @@ import pytest
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from swarmctl.core.clock import ClockError, OffsetClock, SimClock
+from swarmctl.errors import ConfigError
 from swarmctl.telemetry.evaluation.referee import evaluate
 from swarmctl.telemetry.evaluation.tracks import mission_start_us, track_error, tracking_rows
 
@@ -85,3 +86,8 @@ def test_recorded_frames_are_stamped_with_the_own_clock(tmp_path: Path) -> None:
         log.close()
     first_us = [int.from_bytes((tmp_path / f"agent-{i}.tlog").read_bytes()[:8], "big") for i in (0, 1)]
     assert first_us[1] - first_us[0] == AHEAD_US
+
+
+def test_a_tick_of_no_whole_number_of_steps_is_refused_as_a_configuration() -> None:
+    with pytest.raises(ConfigError, match=r"sitl\.physics_hz = 250: in lockstep a multiple of agent\.rate_hz = 40"):
+        Lockstep(load(None, ("agent.rate_hz=40",)))

@@ -639,3 +639,27 @@ def test_summary_holds_no_nan_and_every_contract_key(data: RunData) -> None:
         "unresponsive",
         "reopened",
     }
+
+
+GROUNDED = Rules(agents=1, required_separation_m=0.5, ground_z_m=2.0)
+
+
+def fallen(mode: Mode = Mode.TRACKING, phase: Phase = Phase.TRACK, tilt_rad: float = 0.0, down_m: float = 0.0) -> Any:
+    """The violations of a vehicle that is so from 5 s on, for half a second, in truth and by its autopilot."""
+    rows = ticks(20, (0.0, 0.0, 0.0))
+    late = (rows["mission_t_s"] >= 5.0) & (rows["mission_t_s"] < 5.5)
+    rows["mode"][late], rows["phase"][late] = mode, phase
+    rows["q_nb"][late, 0], rows["q_nb"][late, 1] = math.cos(tilt_rad / 2), math.sin(tilt_rad / 2)
+    rows["pos_ned_m"][late, 2] = down_m
+    return evaluate(run({0: rows}, truth(0, rows["mission_t_s"], rows["pos_ned_m"])), GROUNDED, "completed")[
+        "violations"
+    ]
+
+
+def test_a_vehicle_that_its_agent_flies_to_the_ground_or_that_turns_over_has_crashed() -> None:
+    assert fallen() == fallen(tilt_rad=1.0) == fallen(down_m=1.9) == []
+    assert fallen(tilt_rad=1.6) == ["agent 0 turned over at 5.0 s"]
+    assert fallen(down_m=1.99) == ["agent 0 touched the ground in flight, at 5.0 s"]
+    assert fallen(down_m=2.0, phase=Phase.GOTO_LAND) == fallen(down_m=2.0)
+    for lands in ({"mode": Mode.PILOT_OVERRIDE}, {"mode": Mode.IDLE, "phase": Phase.LAND}):
+        assert fallen(down_m=2.0, tilt_rad=1.6, **lands) == []

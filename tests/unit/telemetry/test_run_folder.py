@@ -25,7 +25,7 @@ from swarmctl.files import hold
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
-from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run
+from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run, write_config
 from swarmctl.telemetry.report.thinning import thin
 
 UTC_US = 1_780_000_000_000_000
@@ -386,3 +386,25 @@ def test_thinning_keeps_peaks() -> None:
     assert len(kept_x) <= 600
     assert (kept_y.max(), kept_y.min()) == (50.0, -50.0)
     assert np.all(np.diff(kept_x) > 0)
+
+
+def test_the_configuration_of_somebody_else_is_not_overwritten(tmp_path: Path) -> None:
+    write_config(tmp_path, "a = 1\n")
+    write_config(tmp_path, "a = 1\n")  # by the Python API, then by the launch
+    with pytest.raises(ConfigError, match=r"holds another config\.toml"):
+        write_config(tmp_path, "a = 2\n")
+    assert (tmp_path / "config.toml").read_text() == "a = 1\n"
+
+
+def test_the_folder_of_a_campaign_or_sweep_is_no_run(tmp_path: Path) -> None:
+    write_run(tmp_path, 1, 4.0)
+    (tmp_path / "rows.parquet").write_bytes(b"")
+    (tmp_path / "report.html").write_text("its page")
+    with pytest.raises(ConfigError, match="holds a campaign or a sweep"):
+        report_run(tmp_path, RULES)
+    assert (tmp_path / "report.html").read_text() == "its page"
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "report.html").write_text("a page")
+    with pytest.raises(ConfigError, match=r"holds a run already \(report\.html\)"):
+        create_run_folder(other, "circle", UTC_US)

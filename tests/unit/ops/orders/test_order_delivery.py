@@ -168,6 +168,10 @@ def test_who_is_asked() -> None:
         addressed(LAUNCH, Order("exclude", {PEER: 9.0}), [])
     with pytest.raises(ConfigError, match="there is no agent 1; alone-1a has agent 0 only"):
         addressed(alone, Order("hold"), [1])
+    with pytest.raises(ConfigError, match=r"--peer 1\.2: expected the number of an agent"):
+        addressed(LAUNCH, Order("exclude", {PEER: 1.2}), [])
+    with pytest.raises(ConfigError, match="agent 1 is not asked whether it has ended itself"):
+        addressed(LAUNCH, Order("exclude", {PEER: 1.0}), [1])
     with pytest.raises(ConfigError) as caught:
         addressed(LAUNCH, Order("hold"), [7, 1, 9, 7])
     assert len(caught.value.problems) == 2, "each once"
