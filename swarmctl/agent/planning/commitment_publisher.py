@@ -54,6 +54,7 @@ class CommitmentPublisher:
         self._half = 0  # of those that are far, by number, which the last message to all has mentioned
         self._news: tuple[object, ...] = (None, None)  # what the last message said that those who hear all wait for
         self._told_reach, self._told_exclusions = _NOWHERE, Exclusions()  # as all know
+        self._last_heard: dict[int, tuple[int, int]] = {}  # of those that are promised to be excluded, until then
         self._asked = 0  # number of the newest proposal that all have been asked to acknowledge
 
     def publish(
@@ -100,7 +101,7 @@ class CommitmentPublisher:
             proposal=proposal,
             acknowledged=acknowledged,
             exclusions=exclusions,
-            heard=self._heard(utc_us, attentive, reach, for_all=for_all),
+            heard=self._frozen(self._heard(utc_us, attentive, reach, for_all=for_all), exclusions.promised),
             reach=reach,
         )
         payload = encode_trajectory_message(message)
@@ -125,6 +126,11 @@ class CommitmentPublisher:
             far = [a for a in self._peers.newest if a in reach.far and (is_rare or a % 2 == self._half)]
             attentive = list({*attentive, *far})
         return self._peers.heard(attentive)
+
+    def _frozen(self, heard: Mapping[int, tuple[int, int]], promised: Set[int]) -> Mapping[int, tuple[int, int]]:
+        """Return the same, but nothing later of who is promised to be excluded: its lease has to end."""
+        late = {agent: self._last_heard.setdefault(agent, heard[agent]) for agent in promised & heard.keys()}
+        return {**heard, **late} if late else heard
 
     def relay(self, utc_us: int) -> None:
         """Pass on what peers lack of each other."""

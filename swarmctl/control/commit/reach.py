@@ -21,8 +21,9 @@ nothing newer. For the others, and for b, B did without A, by condition 1 for `L
 them it was no faster than the v_B that m states, and b is no longer than its L_B. So b lies in the ball, and a outside.
 
 An excluded peer owes nothing as long as its newest message known does not declare the agent far: it commits to nothing
-without the agent then. Otherwise proposals keep clear of its ball. Once its lease has ended, that is all: it can't
-commit without the agent any more, so that the agent is the later one, and needs conditions 1 and 2 no longer.
+without the agent then. Otherwise proposals keep clear of its ball. From the promise to exclude it on, no message says
+that later ones of it were heard. So its lease ends, for good; then that is all: it can't commit without the agent any
+more, so that the agent is the later one, and needs conditions 1 and 2 no longer.
 
 What is committed to unasked, to evade or where a pilot gives the vehicle back, leaves the ball until it is heard: the
 next message of the agent, to all, states its speed and stretch. Until then a far peer may commit to what meets it.

@@ -384,3 +384,26 @@ def test_a_peer_that_is_far_hears_a_few_messages_a_second(far_bench: Bench) -> N
     far_bench.fly(2.0, each=count)
     assert 6 <= counted[topics.FAR_TRAJECTORY] <= 20
     assert counted[topics.TRAJECTORY] >= 40
+
+
+@pytest.mark.parametrize("is_promised", [True, False])
+def test_who_is_promised_to_be_excluded_is_told_of_nothing_later_that_was_heard(
+    far_bench: Bench, is_promised: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its lease ends, although it goes on sending, and hears the agent."""
+    told_us: list[int] = []
+
+    def note() -> None:
+        far_bench.send()
+        for _, payload in far_bench.peer.receive(topics.FAR_TRAJECTORY):
+            message = decode_trajectory_message(payload)
+            assert message is not None
+            told_us.extend(stamp_us for agent, (stamp_us, _) in message.heard.items() if agent == 1)
+
+    far_bench.fly(2.0, each=note)
+    assert told_us[-1] > told_us[0]
+    if is_promised:
+        monkeypatch.setattr(far_bench.coordination._membership, "_promised", frozenset({1}))
+    told_us.clear()
+    far_bench.fly(4.0, each=note)
+    assert (len(set(told_us)) == 1) is is_promised
