@@ -258,7 +258,9 @@ def load_mission(config: Config, path: Path) -> MissionParams:
         own = "is somebody else's code, which is flown only by a launch that was started with it"
         raise ConfigError(source, [f"mission.kind = {changed.mission.kind!r}: {own}"])
     mission = changed.mission
-    if problems := [*mission.kind_problems(), *mission.problems(config.swarm.agents), *_infeasible(changed)]:
+    problems = [*mission.kind_problems(), *mission.problems(config.swarm.agents), *_infeasible(changed)]
+    problems = problems or list(obstacle_problems(changed.obstacles, (), changed.goals_ned_m(), from_ground=False))
+    if problems:
         raise ConfigError(source, problems)
     return mission
 

@@ -33,7 +33,7 @@ def read_tree(path: Path | None) -> dict[str, Any]:
     if path is None:
         return {}
     try:
-        tree = tomllib.loads(read_file(path, _MAX_BYTES, follow=True).decode("utf-8"))
+        tree = tomllib.loads(read_file(path, _MAX_BYTES, follow=True).decode("utf-8-sig"))
     except FileNotFoundError as error:
         raise ConfigError(str(path), [_NO_FILE]) from error
     except OSError as error:

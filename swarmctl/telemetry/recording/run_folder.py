@@ -53,11 +53,13 @@ def create_run_folder(
         advice: what to do where it can't be made.
 
     Raises:
-        ConfigError: `base` contains a run already, or a symbolic link through which files would be written.
+        ConfigError: `base` contains a run already, or a symbolic link through which files would be written, or its name
+            is no text.
         StartError: the folder can't be created.
     """
     try:
         if base is not None:
+            str(base).encode()  # names that are no text could be written to no file of the run
             return _claim(base)
         stamp = datetime.fromtimestamp(utc_us / 1e6, UTC).strftime("%Y%m%dT%H%M%SZ")
         Path("runs").mkdir(exist_ok=True)
@@ -66,6 +68,8 @@ def create_run_folder(
             with contextlib.suppress(FileExistsError):
                 path.mkdir(exist_ok=False)
                 return path
+    except UnicodeEncodeError as error:
+        raise ConfigError("--run-dir", [f"{base!r} is no text in UTF-8. Choose another name"]) from error
     except OSError as error:
         raise StartError(f"run folder can't be made: {error}. {advice}") from error
     raise StartError(f"runs/{stamp}-{name}: {_LAUNCHES_PER_SECOND} launches in one second")

@@ -122,3 +122,17 @@ def test_a_launch_says_what_only_lockstep_plays() -> None:
     assert list(unplayed(load(None))) == []
     (said,) = unplayed(load(None, ["bus.loss_01=0.5", "sitl.link_latency_ms=100"]))
     assert said.startswith("bus.loss_01 = 0.5, sitl.link_latency_ms = 100: of lockstep only")
+
+
+def test_a_mission_whose_goals_are_in_an_obstacle_is_refused_in_flight_too(tmp_path: Path) -> None:
+    flying = load(None, ["obstacles=[{center_ned_m=[4.0,0.0,-3.0],radius_m=0.5,keep_out_m=1.0}]"])
+    path = tmp_path / "goals.toml"
+    for north_m, refused in ((4.0, True), (8.0, False)):
+        goals = f"[[{north_m}, 0.0, -3.0], [{north_m}, 4.0, -3.0], [{north_m}, 8.0, -3.0]]"
+        text = f"[mission]\nkind = 'goto'\nduration_s = 60\n[mission.goto]\ngoals_ned_m = {goals}\n"
+        path.write_text("\ufeff" + text, encoding="utf-8")  # with a mark of its byte order, as editors write it
+        if refused:
+            with pytest.raises(ConfigError, match=r"the goal of agent 0 is 0\.00 m from its centre"):
+                load_mission(flying, path)
+        else:
+            load_mission(flying, path)

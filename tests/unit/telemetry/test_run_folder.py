@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from html.parser import HTMLParser
@@ -386,6 +387,11 @@ def test_thinning_keeps_peaks() -> None:
     assert len(kept_x) <= 600
     assert (kept_y.max(), kept_y.min()) == (50.0, -50.0)
     assert np.all(np.diff(kept_x) > 0)
+
+
+def test_a_folder_whose_name_is_no_text_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no text in UTF-8"):
+        create_run_folder(tmp_path / os.fsdecode(b"bad\xff"), "circle", UTC_US)
 
 
 def test_the_configuration_of_somebody_else_is_not_overwritten(tmp_path: Path) -> None:
