@@ -183,6 +183,11 @@ class Config(Params):
             keys |= {"faults": tuple(fault for fault in self.sitl.faults if fault.vehicle in here)}
         return validated(SimulatorConfig, keys, "sitl")
 
+    @property
+    def ground_z_m(self) -> float | None:
+        """Return the down coordinate of the simulator's ground; None for real vehicles, whose ground is unknown."""
+        return self.sitl.ground_z_m if self.sitl.enabled else None
+
     def rules(self, mode: Literal["realtime", "lockstep"] = "realtime") -> Rules:
         """Return the rules by which the referee judges this run."""
         return Rules(
@@ -197,7 +202,7 @@ class Config(Params):
             duration_s=self.mission.duration_s,
             downwash=self.separation.downwash,
             volume=self.volume.flight_volume(),
-            ground_z_m=self.sitl.ground_z_m if self.sitl.enabled else None,
+            ground_z_m=self.ground_z_m,
             goals_ned_m=self.goals_ned_m(),
         )
 
@@ -354,7 +359,7 @@ def _infeasible(config: Config) -> Iterator[str]:
         duration_s=config.mission.duration_s,
         apart_m=0.0 if close else separation.radius_m,  # what follows from starts is not said again
         downwash=separation.downwash,
-        ground_z_m=config.sitl.ground_z_m if config.sitl.enabled else None,
+        ground_z_m=config.ground_z_m,
         volume=None if any(config.volume.problems()) else config.volume.flight_volume(),
         fence=config.geofence.area(),
     )

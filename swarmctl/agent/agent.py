@@ -249,7 +249,7 @@ class Agent:
         """Take in what the vehicle has sent; return its newest state."""
         autopilot, commands = self._ports.autopilot, self._ports.commands
         state = autopilot.poll(now_us)
-        commands.step(now_us, assures=autopilot.is_attended(now_us))
+        commands.step(now_us, heartbeat=autopilot.is_attended(now_us))
         for result in commands.results():
             self._vehicle_setup.on_result(result)
             self._vehicle_watch.on_result(result, now_us)

@@ -103,10 +103,9 @@ class PeerPaths:
         """Return the newest path of every peer, whatever its age, sorted by agent number."""
         return tuple(self._newest.values())
 
-    def newest_utc_us(self, agent: int) -> int | None:
-        """Return the time of the newest path of a peer, within reach or not; None before the first."""
-        path = self._newest.get(agent)
-        return None if path is None else path.t0_utc_us
+    def newest_utc_us(self, agent: int) -> int:
+        """Return the time of the newest path of a peer, within reach or not; 0 before the first."""
+        return self._newest[agent].t0_utc_us if agent in self._newest else 0
 
     def attend(self, within_reach: Iterable[int], utc_us: int) -> None:
         """Take these peers, and no others, for those within reach."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -28,7 +28,16 @@ def config_warnings(config: Config) -> list[str]:
 
 def warning_lines(config: Config) -> list[str]:
     """Return the same as lines to print."""
-    return [f"warning: {text}" for text in config_warnings(config)]
+    return _as_lines(config_warnings(config))
+
+
+def launch_warning_lines(config: Config) -> list[str]:
+    """Return the lines to print before a launch, which has no links in lockstep."""
+    return _as_lines([*config_warnings(config), *unplayed(config)])
+
+
+def _as_lines(texts: Iterable[str]) -> list[str]:
+    return [f"warning: {text}" for text in texts]
 
 
 def unplayed(config: Config) -> Iterator[str]:

@@ -108,14 +108,14 @@ class CommandPort:
         elif kind == "PARAM_ERROR" and current.name and message.param_id == current.name:
             self._finish(False, f"parameter error {message.error}")
 
-    def step(self, now_us: int, *, assures: bool = True) -> None:
+    def step(self, now_us: int, *, heartbeat: bool = True) -> None:
         """Send what is due: a heartbeat, and the open command if it was not answered; called once per tick.
 
         Args:
             now_us: monotonic time.
-            assures: whether the vehicle may be told that somebody flies it (`Autopilot.is_attended`).
+            heartbeat: whether the vehicle may be told that somebody flies it (`Autopilot.is_attended`).
         """
-        if assures and now_us >= self._heartbeat_us:
+        if heartbeat and now_us >= self._heartbeat_us:
             self._heartbeat_us = now_us + _HEARTBEAT_US
             beat = mavlink.MAVLink_heartbeat_message(_GROUND_STATION, _NO_AUTOPILOT, 0, 0, _ACTIVE, 3)
             self._send(self._codec.encode(beat))

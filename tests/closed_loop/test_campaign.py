@@ -19,9 +19,9 @@ from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight, fly
 from sitl.studies.campaign.page import REPORT
 from sitl.studies.campaign.quick import QUICK
-from sitl.studies.campaign.store import ROWS
 from sitl.studies.campaign.trials import Cell, Row, Trial, trial_of
 from swarmctl.core.types import Phase
+from swarmctl.telemetry.recording.run_files import STUDY_ROWS
 
 ROOT = Path(__file__).parents[2]
 SHOWN = "    swarmctl campaign "
@@ -29,7 +29,7 @@ TOUCH_M = {"swap": 0.48, "random": 0.15}
 
 
 def rows_in(directory: Path) -> list[Row]:
-    rows: list[Row] = pq.read_table(directory / ROWS).to_pylist()
+    rows: list[Row] = pq.read_table(directory / STUDY_ROWS).to_pylist()
     return rows
 
 
@@ -114,7 +114,7 @@ def test_a_killed_campaign_resumes(tmp_path: Path) -> None:
     children: list[psutil.Process] = []
     try:
         deadline_s = time.monotonic() + 100.0
-        while not (tmp_path / ROWS).exists() and time.monotonic() < deadline_s:
+        while not (tmp_path / STUDY_ROWS).exists() and time.monotonic() < deadline_s:
             time.sleep(0.1)
         children = psutil.Process(campaign.pid).children(recursive=True)
     finally:

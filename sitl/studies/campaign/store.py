@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 from sitl.studies.campaign.trials import SCHEMA, Row, Trial, trial_of
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replaced
+from swarmctl.telemetry.recording.run_files import STUDY_ROWS
 
-ROWS = "rows.parquet"
 _SAVE_EVERY_S = 1.0
 _MAX_BYTES = 2**31
 _Job = TypeVar("_Job")  # what is flown, and its result told from others by
@@ -56,7 +56,7 @@ class RowStore(Generic[_Job]):
     def __init__(
         self, directory: Path, code: str, mix: bool = False, *, schema: pa.Schema, job_of: Callable[[Row], _Job]
     ) -> None:
-        self._path = directory / ROWS
+        self._path = directory / STUDY_ROWS
         self._schema, self._job_of = schema, job_of
         self.rows: list[Row] = []
         with writing(directory):

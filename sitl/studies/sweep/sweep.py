@@ -15,7 +15,7 @@ from rich.table import Table
 
 from sitl.studies.campaign.progress import collect
 from sitl.studies.campaign.source import code_id
-from sitl.studies.campaign.store import ROWS, RowStore, writing
+from sitl.studies.campaign.store import RowStore, writing
 from sitl.studies.campaign.worker_pool import on_this_machine
 from sitl.studies.sweep.figures import FIGURES, SHOWN, Combination, Row, combinations, schema_of
 from sitl.studies.sweep.flight import FlySweep
@@ -25,6 +25,7 @@ from swarmctl.config import Config, dump, load
 from swarmctl.core.text import told_apart
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError
 from swarmctl.files import replace_text
+from swarmctl.telemetry.recording.run_files import STUDY_ROWS
 
 BASE = "config.toml"  # in the folder: the configuration to which swept values are applied
 _SHOWN_CHANGES = 5
@@ -71,7 +72,7 @@ def sweep(options: SweepOptions) -> int:
     found = combinations(axes, rows)
     report = write_page(options.out, axes, found, code_id(), config_text=dump(base))
     _print_table(axes, found)
-    print(f"{count} flown in {time.monotonic() - began_s:.0f} s; {options.out / ROWS}, {report}")
+    print(f"{count} flown in {time.monotonic() - began_s:.0f} s; {options.out / STUDY_ROWS}, {report}")
     for error in errors:
         print(error, file=sys.stderr)
     failed = errors or any(row["outcome"] != "completed" for row in rows)

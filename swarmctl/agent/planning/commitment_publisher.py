@@ -114,7 +114,7 @@ class CommitmentPublisher:
     def _heard(
         self, utc_us: int, attentive: Sequence[int], reach: Reach, *, for_all: bool
     ) -> Mapping[int, tuple[int, int]]:
-        """Return what the message says about what was heard: of the far half in turns, or all if it is rare."""
+        """Return what the message says about what was heard: half of the far in turns, or all if messages are few."""
         if not self._far_us:
             return self._peers.heard(attentive)
         if not for_all and utc_us < self._heard_us + _HEARD_US:

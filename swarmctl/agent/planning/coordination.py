@@ -92,7 +92,7 @@ class Coordination:
         self._spared: frozenset[int] = frozenset()  # peers whose acknowledgement of the proposal is not required
         self._hears = self._peers  # every message of these
         self._others_m_s = 0.0  # speed at which somebody else flies the vehicle
-        self._brake_m_s2 = params.brake_m_s2
+        self._params = params
         self._is_committed = False
         self._tube_m = separation.budget.tube_m
         self._tube = Tube(self._tube_m)
@@ -300,7 +300,7 @@ class Coordination:
                 commitments.trajectories,
                 away_m=commitments.late_m(utc_us),
                 speed_m_s=self._others_m_s,
-                stops_m=0.5 * self._others_m_s**2 / self._brake_m_s2,
+                stops_m=self._params.stop_m(self._others_m_s),
             ),
             refused=self._ended | exclusions.promised,
         )

@@ -255,8 +255,8 @@ class WorldModel:
 
         Of a peer out of reach only paths are heard.
         """
-        heard_us = (self._status_us.get(agent), self.paths.newest_utc_us(agent))
-        age_us = max(0, utc_us - max([at_us for at_us in heard_us if at_us is not None], default=utc_us - _SILENT_US))
+        heard_us = max(self._status_us.get(agent, 0), self.paths.newest_utc_us(agent))
+        age_us = max(0, utc_us - heard_us)
         if self.has_ended(agent) or age_us >= _SILENT_US:
             return ""
         return f"{agent_name(agent)} was heard {age_us * 1e-6:.1f} s ago, so it has not ended"

@@ -33,7 +33,11 @@ class CommitParams(Params):
 
     def stretch_m(self, speed_m_s: float) -> float:
         """Return the length [m] of the longest proposal that is no faster than this, with its final braking."""
-        return speed_m_s * (self.horizon * self.dt_s + _MODEST_LEAD_S) + 0.5 * speed_m_s**2 / self.brake_m_s2
+        return speed_m_s * (self.horizon * self.dt_s + _MODEST_LEAD_S) + self.stop_m(speed_m_s)
+
+    def stop_m(self, speed_m_s: float) -> float:
+        """Return the way [m] on which a vehicle brakes to rest."""
+        return 0.5 * speed_m_s**2 / self.brake_m_s2
 
     def for_vehicle(self, vehicle: VehicleModelParams) -> CommitParams:
         """Return parameters by which a proposal leaves what is committed no sooner than the vehicle can.

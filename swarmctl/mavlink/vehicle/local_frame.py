@@ -60,8 +60,7 @@ class LocalFrame:
     drawn_ned_m: Array
     margin_m: float
     _is_reset: bool  # the estimator itself has reported the newest jump
-    _unexplained: bool  # bridged, and not yet known whether the origin has moved
-    _asks_origin: bool  # the same of a reset, with which it may have moved
+    _may_have_moved: bool  # bridged, and not yet known whether the origin has moved
     _jumped_us: int
 
     def __init__(self, shared: GeoOrigin) -> None:
@@ -79,7 +78,12 @@ class LocalFrame:
     @property
     def wants_origin(self) -> bool:
         """Whether GPS_GLOBAL_ORIGIN should be requested now."""
-        return self.offset_ned_m is None or self._unexplained or self._asks_origin
+        return self.offset_ned_m is None or self._may_have_moved
+
+    @property
+    def _unexplained(self) -> bool:
+        """Whether that jump is of the origin or of the estimate: a reset is of the estimate, and counted already."""
+        return self._may_have_moved and not self._is_reset
 
     def forget(self) -> None:
         """Discard the origin: the vehicle has rebooted and counts from another point."""
@@ -97,7 +101,7 @@ class LocalFrame:
         else:
             self._moved_to = None
             self.jumps += self._unexplained  # the frame is unchanged, so the estimate has jumped
-            self._unexplained = self._asks_origin = False
+            self._may_have_moved = False
 
     def seen(self, place: GeoOrigin, t_us: int, local_us: int, pos_ned_m: Array, *, vel_ned_m_s: Array) -> None:
         """Take a geodetic position at `t_us` beside the newest local one at `local_us`: the fallback for the origin."""
@@ -144,15 +148,14 @@ class LocalFrame:
         missed_m = math.dist(missing_ned_m.tolist(), self.bridge_ned_m.tolist())
         if self._moved_to is not None:
             moved_m = math.dist(pos_ned_m + self._moved_to, expected_ned_m)
-            if moved_m < leeway_m and (self._unexplained or self._asks_origin or moved_m < missed_m):
+            if moved_m < leeway_m and (self._may_have_moved or moved_m < missed_m):
                 self._take_origin()
                 return
         if missed_m < leeway_m:
             return
         self.bridge_ned_m, self._jumped_us, self._is_reset = missing_ned_m, t_us, reset
         self.jump_m = math.sqrt(float(missing_ned_m @ missing_ned_m))
-        has_left = self.jump_m >= step_m  # otherwise it has jumped back
-        self._unexplained, self._asks_origin = has_left and not reset, has_left and reset
+        self._may_have_moved = self.jump_m >= step_m  # otherwise it has jumped back
         self.jumps += reset
 
     def _draw_in(self, t_us: int, since_s: float) -> None:
@@ -161,7 +164,7 @@ class LocalFrame:
         left_m = 0.0 if bridge_ned_m is _NOTHING else math.sqrt(float(bridge_ned_m @ bridge_ned_m))
         if t_us - self._jumped_us > _ASKED_US:  # no moved origin has been reported
             self.jumps += self._unexplained
-            self._unexplained = self._asks_origin = False
+            self._may_have_moved = False
         doubted_m = self.jump_m if left_m else 0.0
         if self.drawn_ned_m is not _NOTHING:
             doubted_m = math.dist((bridge_ned_m + self.drawn_ned_m).tolist(), (0.0, 0.0, 0.0))
@@ -177,11 +180,11 @@ class LocalFrame:
         """Adopt a moved origin: positions have moved with it, and there was no jump."""
         if self._moved_to is not None:
             self.offset_ned_m, self._moved_to = self._moved_to, None
-            self.bridge_ned_m, self._unexplained, self._asks_origin = _NOTHING, False, False
+            self.bridge_ned_m, self._may_have_moved = _NOTHING, False
 
     def _settle(self) -> None:
         self.bridge_ned_m, self.drawn_ned_m, self.margin_m = _NOTHING, _NOTHING, 0.0
-        self._is_reset, self._unexplained, self._asks_origin, self._jumped_us = False, False, False, 0
+        self._is_reset, self._may_have_moved, self._jumped_us = False, False, 0
 
     def _in_shared(self, place: GeoOrigin) -> Array:
         shared = self._shared

@@ -26,7 +26,7 @@ from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
 from swarmctl.bus.topics import ENDED, OBSTACLES, OPERATOR, STATUS, TICK, Topic
 from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, socket_file
 from swarmctl.config import Config, dump
-from swarmctl.configuration.config_warnings import unplayed, warning_lines
+from swarmctl.configuration.config_warnings import launch_warning_lines
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.flight.summary import sum_up
 from swarmctl.ops.orders.operator import list_keepers
@@ -203,8 +203,7 @@ class Launcher(Services):
         for command in agent_commands(config, context, reserved.sockets, reserved.vehicle_sockets):
             self._spawn(command)
         self.announce("")
-        doubts = [*warning_lines(config), *(f"warning: {text}" for text in unplayed(config))]
-        for line in (*_introduction(config, context, reserved), *doubts):
+        for line in (*_introduction(config, context, reserved), *launch_warning_lines(config)):
             self.display.print_line(line)
         realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
         self.log.write(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.types import FLOWN_BY_AGENT, Phase
+from swarmctl.telemetry.evaluation.attitude import tilt_rad
 from swarmctl.telemetry.evaluation.tracks import Tracks
 
 _OVER_RAD = 1.4  # no plan tilts as much
@@ -34,8 +35,7 @@ def crashes(
         if not len(flown):
             continue
         times_us = flown[tracks.time_field]
-        q_nb = flown["q_nb"].astype(np.float64)
-        over = 1.0 - 2.0 * (q_nb[:, 1] ** 2 + q_nb[:, 2] ** 2) < np.cos(_OVER_RAD)
+        over = tilt_rad(flown["q_nb"]) > _OVER_RAD
         if over.any():
             yield f"agent {agent} turned over at {at_s(float(times_us[np.argmax(over)])):.1f} s"
         if ground_z_m is None or agent >= tracks.pos_ned_m.shape[1] or not len(tracks.t_us):

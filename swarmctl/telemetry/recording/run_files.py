@@ -38,6 +38,7 @@ PACKED_PLANS = ".plans.parquet"  # of an agent in a finished run; while it flies
 PACKED_TRUTH = "truth.parquet"  # of a finished run
 CONFIG = "config.toml"
 RECORDING = "telemetry.rrd"
+STUDY_ROWS = "rows.parquet"  # of a campaign or a sweep, whose folder holds no run
 AGENT_FILE = re.compile(r"^agent-(\d{1,3})\.(ticks|parquet)$")
 
 _MAX_ROWS_BYTES = 2**31  # a day of one agent, about the memory of a laptop

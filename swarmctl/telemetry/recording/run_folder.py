@@ -23,6 +23,7 @@ from swarmctl.telemetry.recording.run_files import (
     PACKED_PLANS,
     PACKED_TRUTH,
     RECORDING,
+    STUDY_ROWS,
     SUMMARY,
     TRUTH,
     load_run,
@@ -37,8 +38,7 @@ from swarmctl.telemetry.report.comparison import JudgedRun, write_comparison
 from swarmctl.telemetry.report.run_report import FIGURES, REPORT, write_figures, write_report
 
 _LAUNCHES_PER_SECOND = 1000
-_STUDY = "rows.parquet"  # of a campaign or a sweep
-_TAKEN = frozenset((EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING, REPORT, _STUDY))
+_TAKEN = frozenset((EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING, REPORT, STUDY_ROWS))
 
 
 def create_run_folder(
@@ -152,7 +152,7 @@ def report_run(directory: Path, rules: Rules) -> Path:
         ConfigError: a file in the folder has not the expected content.
         StartError: the folder can't be written to, or the run is not finished and somebody still records it.
     """
-    if (directory / _STUDY).exists():
+    if (directory / STUDY_ROWS).exists():
         raise ConfigError(str(directory), [f"holds a campaign or a sweep, whose page is {REPORT}, and no run"])
     if read_summary(directory) is None:
         _refuse_recorded(directory)

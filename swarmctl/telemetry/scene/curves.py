@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from swarmctl.core.recorded.tick_record import CURVES
 from swarmctl.core.types import Array, Phase
-from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
+from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad, tilt_rad
 from swarmctl.telemetry.palette import REFERENCE_RGB, SPARE_RGB, agent_rgb
 from swarmctl.telemetry.scene.stream import Stream, Times
 from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
@@ -75,9 +75,7 @@ def left_percent(rows: NDArray[np.void], bounds: AgentBounds, tick_ms: float) ->
 
     Tilt and thrust are those of the setpoints sent; without one they are NaN.
     """
-    q = np.asarray(rows["setpoint_q_nb"], np.float64)
-    cos_tilt = 1.0 - 2.0 * (q[:, 1] ** 2 + q[:, 2] ** 2)
-    tilt_01 = np.arccos(np.clip(cos_tilt, -1.0, 1.0)) / bounds.tilt_max_rad
+    tilt_01 = tilt_rad(rows["setpoint_q_nb"]) / bounds.tilt_max_rad
     thrust_01 = np.asarray(rows["setpoint_thrust_01"], np.float64)
     nearer_01 = np.minimum(thrust_01 - bounds.thrust_min_01, bounds.thrust_max_01 - thrust_01)
     half_01 = 0.5 * (bounds.thrust_max_01 - bounds.thrust_min_01)

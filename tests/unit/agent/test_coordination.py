@@ -407,3 +407,38 @@ def test_who_is_promised_to_be_excluded_is_told_of_nothing_later_that_was_heard(
     told_us.clear()
     far_bench.fly(4.0, each=note)
     assert (len(set(told_us)) == 1) is is_promised
+
+
+@pytest.mark.parametrize(("far_hz", "share_01"), [(2.0, 1.0), (4.0, 0.5)])
+def test_seldom_messages_to_all_say_each_time_what_was_heard_of_who_is_far(far_hz: float, share_01: float) -> None:
+    """Half of them in turns, as with 4 Hz, one lost message would let the lease end."""
+    bench, told = Bench(far_hz=far_hz), list[bool]()
+    bench.place, bench.reach = (
+        np.array([30.0, 0.0, -2.0]),
+        Reach(far=frozenset({0}), speed_m_s=_SPEED_M_S, stretch_m=_STRETCH_M),
+    )
+
+    def note() -> None:
+        bench.send()
+        for _, payload in bench.peer.receive(topics.FAR_TRAJECTORY):
+            message = decode_trajectory_message(payload)
+            assert message is not None
+            told.append(1 in message.heard)
+
+    bench.fly(1.0, each=note)
+    told.clear()
+    bench.fly(6.0, each=note)
+    assert sum(told) / len(told) == pytest.approx(share_01, abs=0.1)
+
+
+@pytest.mark.parametrize("has_ended", [True, False])
+def test_a_far_peer_that_has_ended_makes_no_proposal_ask_all(far_bench: Bench, has_ended: bool) -> None:
+    far_bench.fly(1.0, each=far_bench.send)
+    if has_ended:
+        far_bench.world_model.exclude(1)
+    far_bench.fly(2.0)  # its lease ends
+    far_bench.peer.receive(topics.FAR_TRAJECTORY)
+    far_bench.fly(1.0)
+    said = [decode_trajectory_message(payload) for _, payload in far_bench.peer.receive(topics.FAR_TRAJECTORY)]
+    asked = {message.proposal.asks_far for message in said if message is not None and message.proposal is not None}
+    assert (True in asked) is not has_ended

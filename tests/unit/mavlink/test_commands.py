@@ -311,7 +311,7 @@ def test_heartbeats_stop_while_nobody_attends_to_the_vehicle_and_commands_do_not
     bench.port.request(Command(verb=Verb.ARM))
     sent = []
     for k in range(500):  # 10 s, of which 3 to 7 unattended
-        bench.port.step(20_000 * k, assures=not 150 <= k < 350)
+        bench.port.step(20_000 * k, heartbeat=not 150 <= k < 350)
         sent += [(k, dialect.MAVLink(None).decode(bytearray(frame)).get_type()) for frame in bench.out]
         bench.out.clear()
     beats = [k for k, kind in sent if kind == "HEARTBEAT"]
