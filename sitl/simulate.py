@@ -38,10 +38,13 @@ def simulate(config: Config, directory: Path) -> int:
     flight = Lockstep(config, directory)
     stop = StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP, raise_at=2)  # the first request lands
     began_s = time.perf_counter()
+    is_landing = False
     with _progress(config) as advance:
 
         def on_step(lockstep: Lockstep) -> None:
-            if stop.take():
+            nonlocal is_landing
+            if stop.count and not is_landing:
+                is_landing = True
                 lockstep.command("land")
             advance(lockstep.clock.now_us() * 1e-6)
 

@@ -304,6 +304,11 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
     agents, separation = config.swarm.agents, config.separation
     yield from _start_problems(config)
     yield from vehicle_problems(config.vehicles, agents, simulated=config.sitl.enabled, hosts=config.hosts)
+    if config.swarm.agents_per_process > 1 and not config.sitl.enabled:
+        shared = (
+            f"swarm.agents_per_process = {config.swarm.agents_per_process}: allowed: 1 without the built-in simulator"
+        )
+        yield f"{shared}; one agent's failure must not be that of other real vehicles"
     yield from host_problems(config.hosts, agents)
     yield from simulated_host_problems(config.hosts if config.sitl.enabled else ())
     yield from forward_problems(config.mavlink.forward)

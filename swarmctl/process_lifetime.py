@@ -72,7 +72,6 @@ class StopRequest:
         os.set_blocking(self._write_fd, False)
         self._raise_at = raise_at
         self.count = 0
-        self._taken = 0
         under_nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
         heard = [signum for signum in signums if signum != signal.SIGHUP or not under_nohup]
         self._before = {signum: signal.signal(signum, self._note) for signum in heard}
@@ -94,11 +93,6 @@ class StopRequest:
 
     def is_set(self) -> bool:
         return self.count > 0
-
-    def take(self) -> bool:
-        """Return whether there is a request that has not been taken yet, and take it."""
-        taken, self._taken = self._taken, self.count
-        return self._taken > taken
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for at most `timeout_s`; returns whether a stop has been requested."""

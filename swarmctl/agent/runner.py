@@ -9,11 +9,12 @@ import gc
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
@@ -84,12 +85,13 @@ class StopOrder:
 
     def __init__(self, ask: Callable[[Order, int], str]) -> None:
         self._ask = ask
+        self._taken = 0  # requests that were seen
         self._due_us: int | None = None
 
     def step(self, stop: StopRequest, now_us: int) -> None:
         """Give the order if it is due. Called once in every tick."""
-        if stop.take():
-            self._due_us = now_us
+        if stop.count > self._taken:
+            self._taken, self._due_us = stop.count, now_us
         if self._due_us is not None and now_us >= self._due_us:
             self._due_us = now_us + _STOP_REPEAT_US if self._ask(Order("land"), now_us) else None
 
@@ -111,8 +113,57 @@ class AgentProcess:
     identity: str = ""  # name of the host it speaks for; "": messages are not sealed
 
 
+class Ending(NamedTuple):
+    """How an agent has ended: its exit code, and why its mission was not completed, "" if it was."""
+
+    exit_code: int
+    words: str = ""
+
+
 def run_agent(process: AgentProcess) -> int:
     """Run one agent until its mission has ended; returns the exit code.
+
+    Raises:
+        StartError: link, bus or vehicle can't be reached.
+        ConfigError: the configuration is not valid.
+    """
+    stop = StopRequest(signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    clock = WallClock()
+    with flying_agent(process, clock, stop) as flight:
+        keep_from_collections()
+        if process.realtime:
+            note_priority([flight])
+        ending = _fly(flight, clock)
+    if ending.words:
+        print(ending.words, file=sys.stderr)
+    return ending.exit_code
+
+
+def _fly(flight: RealTimeAgent, clock: WallClock) -> Ending:
+    flight.begin_at(clock.now_us())
+    while True:
+        clock.sleep_until(flight.due_us)
+        ending = flight.step()
+        if ending is not None:
+            return ending
+
+
+def keep_from_collections() -> None:
+    """Keep objects of the start-up out of garbage collections during flight."""
+    gc.collect()
+    gc.freeze()
+
+
+def note_priority(flights: Sequence[RealTimeAgent]) -> None:
+    """Ask for real-time priority for this process, and record in every agent whether it was granted."""
+    granted, spent_s = request_realtime(), time.process_time()
+    for flight in flights:
+        flight.note("realtime", granted=granted, start_up_s=round(spent_s, 3))
+
+
+@contextmanager
+def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> Iterator[RealTimeAgent]:
+    """Open the link, the bus and the recorder of one agent, and close them at the end.
 
     Raises:
         StartError: link, bus or vehicle can't be reached.
@@ -122,50 +173,43 @@ def run_agent(process: AgentProcess) -> int:
     config = load(process.config_path, only_agents=(agent,))
     if not 0 <= agent < config.swarm.agents:
         raise StartError(f"--id {agent}: allowed: 0..{config.swarm.agents - 1} (swarm.agents)")
-    stop = StopRequest(signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     if process.only_land:
         stop.ask()
-    clock = WallClock()
     key = read_own_key(config.mavlink.signing_keys, agent)
     with nullcontext() if key is None else kept_channel(key, AGENT_LINK, clock.utc_us) as signing:
-        return _fly(process, config, clock, stop, signing)
+        transport = _open_link(process, config, clock, signing)
+        recorder = Recorder(process.run_dir, agent)
+        link = _join(process, config, clock)
+        flown = make_agent(
+            config,
+            agent,
+            (clock.utc_us() // 1000) & 0xFFFFFFFF,
+            transport,
+            bus=link,
+            clock=clock,
+            sink=recorder,
+            on_frame=lambda frame: recorder.frame(clock.utc_us(), frame),
+            stopwatch_ns=time.perf_counter_ns,
+            signing=signing,
+            originals=process.originals,
+        )
 
-
-def _fly(
-    process: AgentProcess, config: Config, clock: WallClock, stop: StopRequest, signing: SigningChannel | None
-) -> int:
-    agent = process.agent
-    url = config.vehicles[agent].url if config.vehicles else ""
-    transport = _open_link(process, config, clock, signing)
-    recorder = Recorder(process.run_dir, agent)
-    link = _join(process, config, clock)
-    boot_id = (clock.utc_us() // 1000) & 0xFFFFFFFF
-    flown = make_agent(
-        config,
-        agent,
-        boot_id,
-        transport,
-        bus=link,
-        clock=clock,
-        sink=recorder,
-        on_frame=lambda frame: recorder.frame(clock.utc_us(), frame),
-        stopwatch_ns=time.perf_counter_ns,
-        signing=signing,
-        originals=process.originals,
-    )
-    if process.realtime:
-        granted, spent_s = request_realtime(), time.process_time()
-        recorder.event("realtime", clock.now_us(), clock.utc_us(), granted=granted, start_up_s=round(spent_s, 3))
-    try:
-        vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
-        sessions = SessionWatch(link, lambda name, **f: recorder.event(name, clock.now_us(), clock.utc_us(), **f))
-        return _loop(flown, config, clock, stop, sessions, vehicle=vehicle, only_land=process.only_land)
-    finally:
-        for name, fields in flown.totals(recorder.lost).items():
+        def note(name: str, **fields: Any) -> None:
             recorder.event(name, clock.now_us(), clock.utc_us(), **fields)
-        link.close()
-        transport.close()
-        recorder.close()
+
+        url = config.vehicles[agent].url if config.vehicles else ""
+        vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
+        sessions = SessionWatch(link, note)
+        try:
+            yield RealTimeAgent(
+                flown, config, clock, stop, sessions, note=note, vehicle=vehicle, only_land=process.only_land
+            )
+        finally:
+            for name, fields in flown.totals(recorder.lost).items():
+                note(name, **fields)
+            link.close()
+            transport.close()
+            recorder.close()
 
 
 def _open_link(process: AgentProcess, config: Config, clock: WallClock, signing: SigningChannel | None) -> Transport:
@@ -226,38 +270,73 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
     )
 
 
-def _loop(
-    agent: Agent,
-    config: Config,
-    clock: WallClock,
-    stop: StopRequest,
-    sessions: SessionWatch,
-    *,
-    vehicle: str,
-    only_land: bool,
-) -> int:
-    gc.collect()
-    gc.freeze()  # keep objects of the start-up out of collections during flight
-    landing = StopOrder(agent.ask)
-    pace = Pace(round(1e6 / config.agent.rate_hz), clock.now_us())
-    seen_us = clock.now_us()
-    ever_seen = False
-    finished_us: int | None = None
-    while True:
-        clock.sleep_until(pace.due_us)
-        now_us = clock.now_us()
-        landing.step(stop, now_us)
-        record = agent.tick(now_us, pace.missed)
-        sessions.step()
-        pace.done(now_us + round(record.timing.tick_ms * 1000), clock.now_us())
+class RealTimeAgent:
+    """Ticks one agent at absolute deadlines until its mission has ended.
+
+    Args:
+        agent: the agent.
+        config: its configuration.
+        clock: time of this host.
+        stop: a request to land.
+        sessions: records sessions of the bus that were replaced.
+        note: records an event of this agent, given its name and fields.
+        vehicle: where the vehicle is, in words.
+        only_land: end when the vehicle is down, whatever the peers do.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        config: Config,
+        clock: WallClock,
+        stop: StopRequest,
+        sessions: SessionWatch,
+        *,
+        note: Callable[..., None],
+        vehicle: str,
+        only_land: bool,
+    ) -> None:
+        self._agent, self._config, self._clock, self._stop, self._sessions = agent, config, clock, stop, sessions
+        self.note = note
+        self._vehicle, self._only_land = vehicle, only_land
+        self._landing = StopOrder(agent.ask)
+        self.period_us = round(1e6 / config.agent.rate_hz)
+        self.begin_at(clock.now_us())
+        self._ever_seen = False
+        self._finished_us: int | None = None
+
+    def begin_at(self, first_us: int) -> None:
+        """Set the monotonic time of the first tick, from which the vehicle's silence counts too."""
+        self._pace = Pace(self.period_us, first_us)
+        self._seen_us = first_us
+
+    @property
+    def due_us(self) -> int:
+        """Monotonic time the next tick is due."""
+        return self._pace.due_us
+
+    def step(self) -> Ending | None:
+        """Tick once, now; returns how the mission has ended, None while it has not.
+
+        Raises:
+            StartError: the vehicle was never heard.
+            MissionError: the vehicle is silent.
+        """
+        agent, now_us = self._agent, self._clock.now_us()
+        self._landing.step(self._stop, now_us)
+        record = agent.tick(now_us, self._pace.missed)
+        self._sessions.step()
+        self._pace.done(now_us + round(record.timing.tick_ms * 1000), self._clock.now_us())
         if record.mode is not Mode.STATE_STALE:
-            seen_us, ever_seen = now_us, True
+            self._seen_us, self._ever_seen = now_us, True
         if not agent.done:  # who has landed waits for its peers, and may be switched off
-            _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle, agent.refused_frames)
-        if agent.done if only_land else agent.finished:
-            finished_us = finished_us or now_us
-            if now_us - finished_us > _LINGER_S * 1e6:
-                return _exit_code(agent)
+            silent_us = now_us - self._seen_us
+            _check_vehicle_silence(silent_us, self._ever_seen, self._config, self._vehicle, agent.refused_frames)
+        if agent.done if self._only_land else agent.finished:
+            self._finished_us = self._finished_us or now_us
+            if now_us - self._finished_us > _LINGER_S * 1e6:
+                return _ending(agent)
+        return None
 
 
 def _check_vehicle_silence(
@@ -274,10 +353,10 @@ def _check_vehicle_silence(
         raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up{seen}")
 
 
-def _exit_code(agent: Agent) -> int:
+def _ending(agent: Agent) -> Ending:
     if agent.outcome == "completed":
-        return EXIT_OK
-    print(f"mission not completed: {agent.outcome}", file=sys.stderr)
+        return Ending(EXIT_OK)
+    words = f"mission not completed: {agent.outcome}"
     if agent.outcome == OPERATOR_STOP:
-        return EXIT_INTERRUPTED
-    return EXIT_MISSION if agent.has_armed else EXIT_START
+        return Ending(EXIT_INTERRUPTED, words)
+    return Ending(EXIT_MISSION if agent.has_armed else EXIT_START, words)

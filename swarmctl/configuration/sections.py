@@ -17,6 +17,7 @@ class SwarmParams(OriginParams):
     """Size of the swarm and origin of its frame."""
 
     agents: int = Field(3, ge=1, le=MAX_AGENTS)  # overridden by --agents
+    agents_per_process: int = Field(1, ge=1, le=MAX_AGENTS)  # at most; more than 1 only with the built-in simulator
 
 
 class StartParams(Params):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import os
-import signal
 import sys
 import time
 from pathlib import Path
@@ -19,6 +18,7 @@ import typer
 from swarmctl import __version__
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
+from swarmctl.ops.verbs.agent import add_agent_verb
 from swarmctl.ops.verbs.configuration import config_app
 from swarmctl.ops.verbs.folders import Web, add_folder_verbs, show_in_browser
 from swarmctl.ops.verbs.hosts import add_host_verbs
@@ -195,54 +195,7 @@ def check(
     return check_and_identify(asked, IdentifyOptions(options, write))
 
 
-@app.command()
-def agent(
-    config: Annotated[Path, typer.Option("--config", help="Resolved configuration, a TOML file.")],
-    number: Annotated[int, typer.Option("--id", help="Index of this agent, from 0.")],
-    run: Annotated[str, typer.Option("--run", help="Name of the run on the bus.")],
-    bus: Annotated[str, typer.Option("--bus", help="Endpoint of the bus router.")],
-    run_dir: Annotated[Path, typer.Option("--run-dir", help="Folder to record into.")],
-    fd: Annotated[int | None, typer.Option("--fd", help="Inherited, bound UDP socket to the vehicle.")] = None,
-    vehicle_port: Annotated[
-        int | None, typer.Option("--vehicle-port", help="Loopback port of the vehicle on that link.")
-    ] = None,
-    only_land: Annotated[bool, typer.Option("--only-land", help="Land and disarm the vehicle, then exit.")] = False,
-    originals: Annotated[
-        str, typer.Option("--originals", metavar="JSON", help="Parameters to set back that an ended agent has changed.")
-    ] = "{}",
-    realtime: Annotated[
-        bool, typer.Option(help="Be scheduled before other programs once it is ready, where that is permitted.")
-    ] = False,
-    identity: Annotated[str, typer.Option("--identity", help="Host it speaks for, one of [[hosts]].")] = "",
-) -> int:
-    """Run one agent, whose vehicle and bus are there already. `launch` and `host` start agents."""
-    from swarmctl.agent.runner import AgentProcess, run_agent
-    from swarmctl.process_lifetime import PARENT_ENV, die_with_parent
-    from swarmctl.telemetry.recording.changed_parameters import decode_originals
-
-    try:
-        were = decode_originals(originals)
-    except ValueError as error:
-        raise ConfigError("--originals", [str(error)]) from error
-    if PARENT_ENV in os.environ:
-        die_with_parent(signal.SIGTERM)
-    return run_agent(
-        AgentProcess(
-            config_path=config,
-            agent=number,
-            run=run,
-            bus=bus,
-            run_dir=run_dir,
-            fd=fd,
-            vehicle_port=vehicle_port,
-            only_land=only_land,
-            originals=were,
-            realtime=realtime,
-            identity=identity,
-        )
-    )
-
-
+add_agent_verb(app)
 add_host_verbs(app)
 
 

@@ -67,6 +67,14 @@ class Launched:
             assert time.monotonic() < deadline_s, self.text()
             time.sleep(0.1)
 
+    def until_event(self, name: str, text: str) -> None:
+        """Wait until the launcher has recorded an event with this text."""
+        deadline_s = time.monotonic() + READY_S
+        while not any(row["text"] == text for row in self.events(name)):
+            assert self.process.poll() is None, self.text()
+            assert time.monotonic() < deadline_s, self.text()
+            time.sleep(0.1)
+
     def end(self, timeout_s: float = END_S) -> int:
         """Exit code; afterwards nothing may be left."""
         code = self.process.wait(timeout_s)

@@ -127,6 +127,15 @@ def test_refused_in_one_line_with_key_value_and_what_is_allowed(
     assert "\n" not in text
 
 
+def test_agents_of_real_vehicles_share_no_process(tmp_path: Path) -> None:
+    real = (
+        "sitl.enabled=false",
+        'vehicles=[{sysid=1,url="udpin://0.0.0.0:14540"},{sysid=2,url="udpin://0.0.0.0:14541"}]',
+    )
+    (problem,) = refusals(file_with(tmp_path, ""), "swarm.agents=2", "swarm.agents_per_process=2", *real)
+    assert "swarm.agents_per_process = 2: allowed: 1 without the built-in simulator" in problem
+
+
 def test_those_that_commit_are_heard_often_enough_to_do_without_acknowledgements(tmp_path: Path) -> None:
     commits, path = "separation.mode=guaranteed", file_with(tmp_path, "")
     (problem,) = refusals(path, commits, "agent.path_sharing.far_hz=1.9")

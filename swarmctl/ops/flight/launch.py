@@ -37,6 +37,7 @@ from swarmctl.ops.processes import (
     Command,
     RunContext,
     agent_commands,
+    crowding_warning,
     end_all,
     router_command,
     run_name,
@@ -45,6 +46,7 @@ from swarmctl.ops.processes import (
     wants_realtime,
 )
 from swarmctl.ops.running_launches import RunningLaunch, announce, process_start_s, withdraw
+from swarmctl.ops.shared_children import start_agents
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.ops.supervision.status_table import open_display, tell
 from swarmctl.ops.supervision.supervisor import FlightSupervisor, Services
@@ -183,6 +185,7 @@ class Launcher(Services):
         self.clock = WallClock()
         self.log = EventLog(directory / "launch.events.jsonl", "launch", self.clock.utc_us)
         self.children: dict[str, Child] = {}
+        self._shared: list[Child] = []  # processes of several agents
         self._announced: RunningLaunch | None = None
 
     def start(self) -> None:
@@ -201,9 +204,9 @@ class Launcher(Services):
         if config.sitl.enabled and context.agents:
             self._spawn(sitl_command(config, context, reserved.ports, reserved.vehicle_sockets))
         for command in agent_commands(config, context, reserved.sockets, reserved.vehicle_sockets):
-            self._spawn(command)
+            self._spawn_agents(command)
         self.announce("")
-        for line in (*_introduction(config, context, reserved), *launch_warning_lines(config)):
+        for line in _introduction(config, context, reserved):
             self.display.print_line(line)
         realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
         self.log.write(
@@ -235,7 +238,7 @@ class Launcher(Services):
         router = [child for name, child in self.children.items() if name == ROUTER]
         agents = [child for name, child in self.children.items() if name.startswith(agent_name(0)[:-1])]
         others = [child for child in self.children.values() if child not in router + agents]
-        end_all(agents, agents_grace_s)
+        end_all([*agents, *self._shared], agents_grace_s)
         self._announce_end()
         end_all(others, _STOP_S)
         if self.bus is not None:
@@ -303,6 +306,14 @@ class Launcher(Services):
     def _spawn(self, command: Command) -> None:
         self.children[command.name] = Child(command, self.context.directory)
 
+    def _spawn_agents(self, command: Command) -> None:
+        if len(command.agents) == 1:
+            self._spawn(command)
+            return
+        host, agents = start_agents(command, self.context.directory)
+        self._shared.append(host)
+        self.children.update({child.name: child for child in agents})
+
     def _join_bus(self) -> Bus:
         context = self.context
         senders = [agent_name(agent) for agent in range(self._config.swarm.agents)]
@@ -333,7 +344,7 @@ class Launcher(Services):
 
 
 def _introduction(config: Config, context: RunContext, reserved: ReservedPorts) -> tuple[str, ...]:
-    """Return three lines that say what runs."""
+    """Return three lines that say what runs, and what is doubtful about it."""
     agents = len(context.agents)
     of = f" of {config.swarm.agents}" if agents < config.swarm.agents else ""
     if config.sitl.enabled:
@@ -345,4 +356,6 @@ def _introduction(config: Config, context: RunContext, reserved: ReservedPorts) 
         f"{context.run}: {agents}{of} agent{'s' if config.swarm.agents > 1 else ''}, {vehicles}",
         f"bus {context.endpoint}; {view}",
         f"run folder {context.directory}",
+        *launch_warning_lines(config),
+        *crowding_warning(config, context.agents),
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from swarmctl.config import load
-from swarmctl.ops.processes import Child, Command, wants_realtime
+from swarmctl.ops.processes import Child, Command, RunContext, agent_commands, crowding_warning, wants_realtime
 
 
 @pytest.mark.parametrize(
@@ -35,3 +35,42 @@ def test_the_last_words_of_a_process_control_no_terminal(tmp_path: Path) -> None
     assert child.wait(60.0)
     assert child.how_it_ended() == r"ended with exit code 4: \x1b]0;owned\x07"
     assert child.line_with("owned") == r"\x1b]0;owned\x07"
+
+
+@pytest.mark.parametrize(
+    ("agents", "most", "shares"),
+    [
+        (3, 1, [(0,), (1,), (2,)]),
+        (12, 6, [tuple(range(6)), tuple(range(6, 12))]),
+        (7, 3, [(0, 1), (2, 3), (4, 5, 6)]),  # three processes do, none of which has much more than others
+        (2, 5, [(0, 1)]),
+    ],
+)
+def test_agents_share_processes_as_they_are_told(
+    tmp_path: Path, agents: int, most: int, shares: list[tuple[int, ...]]
+) -> None:
+    config = load(None, (f"swarm.agents={agents}", f"swarm.agents_per_process={most}"))
+    commands = agent_commands(config, RunContext("run", "endpoint", tmp_path, tuple(range(agents))), ())
+    assert [command.agents for command in commands] == shares
+    for command in commands:
+        ids = [command.argv[i + 1] for i, word in enumerate(command.argv) if word == "--id"]
+        assert ids == [str(agent) for agent in command.agents]
+    assert len({command.name for command in commands}) == len(commands)
+
+
+@pytest.mark.parametrize(
+    ("agents", "sets", "share"),
+    [
+        (6, (), ""),
+        (7, (), "swarm.agents_per_process=4 "),
+        (12, (), "swarm.agents_per_process=6 "),
+        (12, ("swarm.agents_per_process=6",), ""),
+    ],
+)
+def test_a_crowd_of_processes_is_warned_of(
+    monkeypatch: pytest.MonkeyPatch, agents: int, sets: tuple[str, ...], share: str
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    lines = crowding_warning(load(None, (f"swarm.agents={agents}", *sets)), range(agents))
+    assert len(lines) == bool(share)
+    assert all(share in line for line in lines)
