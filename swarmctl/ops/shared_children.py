@@ -36,6 +36,11 @@ class SharedAgent(Child):
         if self.poll() is None:
             super().signal(signum)
 
+    def kill_all(self) -> None:
+        """Kill the process, unless this agent has ended; others may fly on in it."""
+        if self.poll() is None:
+            super().kill_all()
+
     def last_line(self) -> str:
         """Return why the agent has ended, or the last line of the process where it has not said so."""
         end = self._ends.end_of(self._agent)

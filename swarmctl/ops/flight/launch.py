@@ -63,6 +63,7 @@ _LAND_S = 30.0
 _CLOCK_TOLD_US = 100_000  # change of the clock that operators' commands are told
 _STOP_S = 10.0  # time for viewer and simulator to write their files
 _ROUTER_STOP_S = 3.0
+_SHARED_STOP_S = 3.0  # time for a process to end after the last of its agents
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,7 +239,8 @@ class Launcher(Services):
         router = [child for name, child in self.children.items() if name == ROUTER]
         agents = [child for name, child in self.children.items() if name.startswith(agent_name(0)[:-1])]
         others = [child for child in self.children.values() if child not in router + agents]
-        end_all([*agents, *self._shared], agents_grace_s)
+        end_all(agents, agents_grace_s)
+        end_all(self._shared, _SHARED_STOP_S)
         self._announce_end()
         end_all(others, _STOP_S)
         if self.bus is not None:

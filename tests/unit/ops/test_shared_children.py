@@ -45,6 +45,7 @@ def test_one_agent_ends_and_the_other_flies_on_until_it_is_sent_a_signal(tmp_pat
     assert (first.last_line(), first.how_it_ended()) == ("silent", "ended with exit code 4: silent")
     assert second.poll() is None
     first.signal(signal.SIGTERM)  # it has ended: the others are not to land
+    first.kill_all()
     time.sleep(0.3)
     assert second.poll() is None
     second.signal(signal.SIGTERM)
