@@ -101,6 +101,7 @@ def _trials(options: argparse.Namespace) -> list[Trial]:
             sets=" ".join(options.sets),
         )
     problems: dict[str, None] = {}
+    found = list(dict.fromkeys(found))  # a value that is given twice is flown once
     for cell in found:
         problems.update(dict.fromkeys(_problems(cell, options.first_seed)))
     if problems:

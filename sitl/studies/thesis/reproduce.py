@@ -154,10 +154,12 @@ def reproduce(only: Sequence[str], plant: bool, full: bool, directory: Path, *, 
     extra = Extra({"circle": radius_m, "obstacle": radius_m}, tuple(index_points(flown)), tuple(notes))
     write_json(directory, rows)
     page = write_page(directory, rows, by_flight(jobs, flown), extra)
-    show(rows, console)
+    if rows:
+        show(rows, console)
     for note in notes:
         print(note, file=sys.stderr)
-    print(f"{counts_text(counted(rows))}; {time.perf_counter() - began_s:.0f} s; {page}")
+    words = counts_text(counted(rows)) if rows else "no figures to compare with; the curves are on the page"
+    print(f"{words}; {time.perf_counter() - began_s:.0f} s; {page}")
     return EXIT_MISSION if failed else EXIT_OK
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.collision_monitor import CollisionMonitor
-from sitl.studies.campaign.command import main
+from sitl.studies.campaign.command import _parser, _trials, main
 from sitl.studies.campaign.conditions.disturbances import DISTURBANCES, NONE, disturbed
 from sitl.studies.campaign.conditions.events import Appearance
 from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS
@@ -228,6 +228,11 @@ def test_cells_that_cannot_be_flown_are_refused_first(
     assert main([*arguments, "--out", str(tmp_path / "none")]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+def test_a_value_that_is_given_twice_is_flown_once() -> None:
+    asked = _parser().parse_args(["--scenario", "swap,swap", "--agents", "2,2", "--loss", "0,0.0", "--trials", "3"])
+    assert [(trial.cell.agents, trial.seed) for trial in _trials(asked)] == [(2, 1), (2, 2), (2, 3)]
 
 
 def test_a_partitioned_bus_delivers_nothing() -> None:
