@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 
 import msgspec
 
 from swarmctl.core.text import printable
 
-_MAX_CHARACTERS = 500  # of the words, so that a line is written whole or not at all (PIPE_BUF)
 _READ_BYTES = 4096
 
 
@@ -29,9 +29,17 @@ class AgentEnd(msgspec.Struct, frozen=True, kw_only=True):
 
 def write_end(fd: int, end: AgentEnd) -> None:
     """Write one end to a pipe; a supervisor that does not read any more is no error."""
-    told = msgspec.structs.replace(end, words=printable(end.words, _MAX_CHARACTERS))
+    words = printable(next((line for line in reversed(end.words.splitlines()) if line.strip()), ""))
+    line = _line(end, words)
+    while len(line) > select.PIPE_BUF:  # more than that could be written in part
+        words = words[: len(words) // 2]
+        line = _line(end, words)
     with contextlib.suppress(OSError):
-        os.write(fd, msgspec.json.encode(told) + b"\n")
+        os.write(fd, line)
+
+
+def _line(end: AgentEnd, words: str) -> bytes:
+    return msgspec.json.encode(msgspec.structs.replace(end, words=words)) + b"\n"
 
 
 class EndReader:

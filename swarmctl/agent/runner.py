@@ -10,7 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -176,10 +176,14 @@ def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> 
     if process.only_land:
         stop.ask()
     key = read_own_key(config.mavlink.signing_keys, agent)
-    with nullcontext() if key is None else kept_channel(key, AGENT_LINK, clock.utc_us) as signing:
+    with ExitStack() as opened:
+        signing = None if key is None else opened.enter_context(kept_channel(key, AGENT_LINK, clock.utc_us))
         transport = _open_link(process, config, clock, signing)
+        opened.callback(transport.close)
         recorder = Recorder(process.run_dir, agent)
+        opened.callback(recorder.close)
         link = _join(process, config, clock)
+        opened.callback(link.close)
         flown = make_agent(
             config,
             agent,
@@ -207,9 +211,6 @@ def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> 
         finally:
             for name, fields in flown.totals(recorder.lost).items():
                 note(name, **fields)
-            link.close()
-            transport.close()
-            recorder.close()
 
 
 def _open_link(process: AgentProcess, config: Config, clock: WallClock, signing: SigningChannel | None) -> Transport:

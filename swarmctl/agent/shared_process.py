@@ -25,8 +25,9 @@ from swarmctl.agent.runner import (
     note_priority,
 )
 from swarmctl.bus.bus import agent_name
+from swarmctl.config import load
 from swarmctl.core.text import printable_lines
-from swarmctl.errors import SwarmError
+from swarmctl.errors import ConfigError, SwarmError
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.wall_clock import WallClock
 
@@ -42,7 +43,15 @@ def run_agents(processes: Sequence[AgentProcess], ends_fd: int | None = None) ->
     Args:
         processes: one for each agent; the first one says whether to ask for real-time priority.
         ends_fd: pipe that is told each end.
+
+    Raises:
+        ConfigError: the configuration is not valid, or of real vehicles.
     """
+    agents = [process.agent for process in processes]
+    if not load(processes[0].config_path, only_agents=agents).sitl.enabled:
+        raise ConfigError(
+            "--id", [f"{', '.join(map(str, agents))}: agents of real vehicles have processes of their own"]
+        )
     stop = StopRequest(signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     clock = WallClock()
     turns = Turns(clock, (lambda end: None) if ends_fd is None else partial(write_end, ends_fd))
@@ -110,16 +119,14 @@ class Turns:
             ending = step()
         except SwarmError as error:
             ending = Ending(error.exit_code, str(error))
-        except Exception as error:  # what would end a process of its own ends this agent
-            traceback.print_exc()
-            ending = Ending(_EXIT_UNEXPECTED, f"{type(error).__name__}: {error}")
+        except (Exception, SystemExit) as error:  # what would end a process of its own ends this agent
+            ending = _unexpected(error)
         if ending is not None:
             self._end(agent, ending)
 
     def _end(self, agent: int, ending: Ending) -> None:
         """Close what an agent has open, in the background: a bus or a disk that hangs delays no other agent."""
         self._flights.pop(agent, None)
-        self._codes.append(ending.exit_code)
         if ending.words:
             print(f"{agent_name(agent)}: {printable_lines(ending.words)}", file=sys.stderr)
         closing = threading.Thread(target=self._close, args=(agent, ending), name=f"end-{agent}")
@@ -129,5 +136,13 @@ class Turns:
     def _close(self, agent: int, ending: Ending) -> None:
         try:
             self._open.pop(agent).close()
-        finally:
-            self._tell(AgentEnd(agent=agent, exit_code=ending.exit_code, words=ending.words))
+        except (Exception, SystemExit) as error:
+            ending = _unexpected(error)
+        self._codes.append(ending.exit_code)
+        self._tell(AgentEnd(agent=agent, exit_code=ending.exit_code, words=ending.words))
+
+
+def _unexpected(error: BaseException) -> Ending:
+    """Print where an exception comes from, and return the end that it is."""
+    traceback.print_exception(error)
+    return Ending(_EXIT_UNEXPECTED, f"{type(error).__name__}: {error}")

@@ -35,6 +35,7 @@ SITL = "sitl"
 VIEWER = "viewer"
 _TAIL_BYTES = 4096
 _CROWDED = 3  # agents for each processor; of six on two 0.04 % of the ticks were late, of nine 10 %
+_CROWDED_SHARED = 6  # of agents that share processes; of twelve on two up to 1.4 %, of twenty most
 _AGENTS_PER_PROCESSOR = 2  # more at real-time priority could leave nothing for shells and the launcher itself
 
 
@@ -52,7 +53,8 @@ class Command:
 class RunContext:
     """Values that all command lines of a launch share: run name, bus endpoint, run folder, agents of this computer.
 
-    On a bus of several computers also the identity as which all of them speak.
+    On a bus of several computers also the identity as which all of them speak. `realtime` says whether what flies asks
+    for real-time priority.
     """
 
     run: str
@@ -60,6 +62,7 @@ class RunContext:
     directory: Path
     agents: tuple[int, ...]
     identity: OwnIdentity | None = None
+    realtime: bool = False
 
 
 def run_name(name: str) -> str:
@@ -78,7 +81,7 @@ def router_command(config: Config, context: RunContext, links: RouterLinks | Non
     """Return the command of the bus router, with its links to other computers if there are any."""
     argv = module_command("swarmctl.bus.network.router", context.endpoint, "--die-with-parent")
     argv += links.arguments() if links is not None else ()
-    return Command(ROUTER, (*argv, _priority_flag(config, context)))
+    return Command(ROUTER, (*argv, _priority_flag(context)))
 
 
 def agent_commands(
@@ -108,7 +111,7 @@ def agent_commands(
         for option, values in (("--id", agents), ("--fd", fds), ("--vehicle-port", ports)):
             argv += tuple(word for value in values for word in (option, f"{value}"))
         argv += () if context.identity is None else ("--identity", context.identity.name)
-        argv += (_priority_flag(config, context),)
+        argv += (_priority_flag(context),)
         name = agent_name(agents[0]) if len(agents) == 1 else f"agents-{agents[0]}-{agents[-1]}"
         commands.append(Command(name, argv, fds, agents))
     return tuple(commands)
@@ -123,10 +126,13 @@ def _shares(agents: int, most: int) -> list[range]:
 def crowding_warning(config: Config, agents: Sequence[int]) -> list[str]:
     """Return what to say where more agents have processes of their own than the processors can serve in time."""
     processors = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-    if not config.sitl.enabled or config.swarm.agents_per_process > 1 or len(agents) <= _CROWDED * processors:
+    processes = len(_shares(len(agents), config.swarm.agents_per_process))
+    if not config.sitl.enabled or (processes <= _CROWDED * processors and len(agents) <= _CROWDED_SHARED * processors):
         return []
     share = -(-len(agents) // processors)
     text = f"{len(agents)} agents on {processors} processors: setpoints may be late, and nobody arms while they are"
+    if len(agents) > _CROWDED_SHARED * processors:
+        return [f"warning: {text}; `swarmctl simulate` flies them on a simulated clock"]
     return [f"warning: {text}; --set swarm.agents_per_process={share} costs half as much"]
 
 
@@ -142,7 +148,7 @@ def sitl_command(
     argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
     argv += ("--control", f"{control_socket(context.endpoint)}")
     argv += ("--events", f"{context.directory / 'sitl.events.jsonl'}")
-    argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent", _priority_flag(config, context))
+    argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent", _priority_flag(context))
     return Command(SITL, argv, fds)
 
 
@@ -161,9 +167,9 @@ def viewer_command(config: Config, context: RunContext, port: int, *, view: bool
     return Command(VIEWER, argv + (("--view",) if view else ()) + (("--web",) if web else ()))
 
 
-def _priority_flag(config: Config, context: RunContext) -> str:
+def _priority_flag(context: RunContext) -> str:
     """Return the flag of a process that delays setpoints, predicted paths or vehicle states when it has to wait."""
-    return "--realtime" if wants_realtime(config, context.agents) else "--no-realtime"
+    return "--realtime" if context.realtime else "--no-realtime"
 
 
 class Child:
@@ -204,11 +210,17 @@ class Child:
         return False
 
     def processor_s(self) -> float | None:
-        """Return the processor time that it has used, or None if it has ended or a debugger holds it."""
+        """Return the processor time that its main thread has used, or None if it has ended or a debugger holds it.
+
+        The main thread of an agent ticks; recorder and bus go on in others where it hangs.
+        """
         with contextlib.suppress(psutil.Error):
             process = psutil.Process(self.pid)
+            if process.status() == psutil.STATUS_TRACING_STOP:
+                return None
+            mains = [thread for thread in process.threads() if thread.id == self.pid]  # of Linux
             used = process.cpu_times()
-            return None if process.status() == psutil.STATUS_TRACING_STOP else used.user + used.system
+            return mains[0].user_time + mains[0].system_time if mains else used.user + used.system
         return None
 
     def signal(self, signum: int) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from swarmctl.agent.agent_end import EndReader
 from swarmctl.bus.bus import agent_name
+from swarmctl.errors import StartError
 from swarmctl.ops.processes import Child, Command
 
 _EXIT_UNTOLD = 1  # of an agent whose process ended well, without a word about it
@@ -60,7 +61,10 @@ def start_agents(command: Command, directory: Path) -> tuple[Child, list[SharedA
     Raises:
         StartError: the program can't be run.
     """
-    read_fd, write_fd = os.pipe()
+    try:
+        read_fd, write_fd = os.pipe()
+    except OSError as error:
+        raise StartError(f"{command.name}: {error}") from error
     argv = (*command.argv, "--ends-fd", f"{write_fd}")
     try:
         host = Child(replace(command, argv=argv, fds=(*command.fds, write_fd)), directory)

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from swarmctl.core.types import Mode, Phase
+from swarmctl.telemetry.evaluation.referee import evaluate
 from tests.closed_loop.conftest import FINE, Flight, Fly, fly_now, mission_is_over
 
 PERIOD_S, LENGTH_M, WIDTH_M = 12.0, 2.0, 1.0
@@ -60,11 +62,29 @@ def test_the_heading_follows_the_file(flown: Flight) -> None:
     assert np.abs(yaw - yaw[0]).max() > 2.0, "it turns with the course"
 
 
+def written_ned_m(figure_8: Path, mission_t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    rows = np.loadtxt(figure_8, delimiter=",", skiprows=1)
+    return np.stack([np.interp(mission_t_s, rows[:, 0], rows[:, c + 1]) for c in range(3)], axis=1)
+
+
 def test_the_reference_is_that_of_the_file(flown: Flight, figure_8: Path) -> None:
     ticks, _ = flown.tracked(0)
-    rows = np.loadtxt(figure_8, delimiter=",", skiprows=1)
-    at = [np.interp(ticks["mission_t_s"], rows[:, 0], rows[:, c + 1]) for c in range(3)]
-    assert np.abs(np.stack(at, axis=1) - ticks["ref_pos_ned_m"]).max() < 0.01
+    assert np.abs(written_ned_m(figure_8, ticks["mission_t_s"]) - ticks["ref_pos_ned_m"]).max() < 0.01
+
+
+def test_the_error_counts_from_the_file_while_an_operator_holds_and_on_the_way_back(fly: Fly, figure_8: Path) -> None:
+    """An agent that is held follows a stop, then a way to where its mission is by now."""
+    orders = {2.0: lambda it: it.command("hold"), 4.5: lambda it: it.command("resume")}
+    held = fly(*own(figure_8), at=orders, until=mission_is_over)
+    rows = held.ticks(0)
+    ticks = rows[(rows["phase"] == Phase.TRACK) & np.isfinite(rows["mission_t_s"])]
+    written = written_ned_m(figure_8, ticks["mission_t_s"])
+    assert np.abs(written - ticks["ref_pos_ned_m"]).max() < 0.01
+    away_m = np.linalg.norm(ticks["pos_ned_m"] - written, axis=1)
+    assert away_m.max() > 1.0, "it stood while the reference went on"
+    assert away_m[ticks["mission_t_s"] > PERIOD_S - 1.0].max() < 0.1, "and is back"
+    summary = evaluate(held.lockstep.recorded(), held.config.rules("lockstep"), "completed", ())
+    assert summary["tracking"]["index_m"] == pytest.approx(float(away_m.mean()), abs=0.02)
 
 
 def test_negative_control_a_controller_without_authority_does_not_fly_it(fly: Fly, figure_8: Path) -> None:

@@ -35,6 +35,7 @@ class ReferenceSelector:
         self._ahead_s, self._now_and_ahead_s = ahead_s, np.concatenate([[0.0], ahead_s])
         self._speed_max_m_s = setup.vehicle_model.speed_max_m_s
         self._mission_ned = np.zeros((len(ahead_s) + 1, 3)), np.zeros((len(ahead_s) + 1, 3))  # positions, velocities
+        self._left_ned: tuple[Array, Array] | None = None  # the mission's own, (1, 3) each, while that is not followed
         self._reported: Deadlock | None = None
 
     def heading_rad(self, utc_us: int) -> float | None:
@@ -51,6 +52,7 @@ class ReferenceSelector:
     def look_ahead(self, now_us: int, utc_us: int) -> None:
         """Take in what the mission asks for from this tick on."""
         self._mission_ned = self._mission.reference(utc_us, now_us, self._now_and_ahead_s)
+        self._left_ned = self._mission.reference_left(utc_us, now_us)
 
     def update(
         self,
@@ -82,10 +84,12 @@ class ReferenceSelector:
         """Return the reference at the times asked for, (N, 3) each, and the mission's own one now, (1, 3).
 
         The first, where it is far away, is approached from the own position (3,) no faster than the vehicle may fly.
-        The mission's own one is that which agents share, without the own place around it.
+        The mission's own one is that which agents share, without the own place around it; before and after the mission
+        it is the one that is followed.
         """
         pos, vel = self._mission_ned
-        now_ref = Reference(pos[:1] - self._mission.place_offset_ned_m, vel[:1], self._yaw_rad)
+        own_ned, own_m_s = (pos[:1], vel[:1]) if self._left_ned is None else self._left_ned
+        now_ref = Reference(own_ned - self._mission.place_offset_ned_m, own_m_s, self._yaw_rad)
         if self._recovery.active:
             return Reference(*self._recovery.sample(self._ahead_s), self._yaw_rad), now_ref
         near = approached(pos[1:], vel[1:], self._ahead_s, pos_ned_m, speed_max_m_s=self._speed_max_m_s)

@@ -145,14 +145,24 @@ class MissionState:
 
     @property
     def place_offset_ned_m(self) -> Array:
-        """Return by how much the present reference (3,) is beside the one that several agents share."""
-        return self.mission_reference.offset_ned_m if self.follows_mission else np.zeros(3)
+        """Return by how much the mission's reference (3,) is beside the one that several agents share."""
+        return self.mission_reference.offset_ned_m if self.phase is Phase.TRACK else np.zeros(3)
 
     def reference(self, utc_us: int, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
         """Return reference positions and velocities, (K, 3) each, NED, at `offsets_s` (K,) from now."""
         if self.follows_mission and self.begin_utc_us is not None:
             return self.trajectories.mission_reference(self.mission_t_s(utc_us), now_us, offsets_s)
         return self.trajectories.reference(now_us, offsets_s)
+
+    def reference_left(self, utc_us: int, now_us: int) -> tuple[Array, Array] | None:
+        """Return the mission's position and velocity now, (1, 3) each, while another reference is followed in it.
+
+        That is one that interrupts the mission, or leads back to it. None: the reference that is followed is its own.
+        """
+        mission_t_s = self.mission_t_s(utc_us)
+        if math.isnan(mission_t_s) or (self.follows_mission and not self.trajectories.rejoins(now_us)):
+            return None
+        return self.mission_reference.sample(np.array([mission_t_s]))
 
     def mission_yaw_rad(self, utc_us: int) -> float | None:
         """Return the yaw of the mission's reference now; None while that is not followed."""

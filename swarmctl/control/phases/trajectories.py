@@ -70,6 +70,11 @@ class Trajectories:
             pos, vel = pos + offset, vel + drift
         return pos, vel
 
+    def rejoins(self, now_us: int) -> bool:
+        """Return whether there is an offset left to the mission's reference."""
+        offset = self._rejoin_offset
+        return offset is not None and (now_us - offset.began_us) * 1e-6 < offset.trajectory.travel_s
+
     def change_mission(self, mission: MissionReference) -> None:
         """Follow another mission from now on."""
         self._mission, self._rejoin_offset = mission, None

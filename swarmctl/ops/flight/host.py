@@ -22,7 +22,13 @@ from swarmctl.errors import ConfigError
 from swarmctl.ops.flight.launch import LaunchOptions, SwarmPart, launch_part
 
 _DIGEST_CHARACTERS = 8
-_OF_A_COMPUTER = (("own_folder",), ("mavlink", "signing_keys"), ("bus", "identities"))  # folders differ, flights do not
+# Folders and processes differ between computers, flights do not.
+_OF_A_COMPUTER = (
+    ("own_folder",),
+    ("mavlink", "signing_keys"),
+    ("bus", "identities"),
+    ("swarm", "agents_per_process"),
+)
 
 
 def load_host(path: Path, agents: Sequence[int], overrides: Sequence[str] = ()) -> tuple[Config, HostParams]:

@@ -181,7 +181,14 @@ class Launcher(Services):
         self._reserved = reserved
         self.display = open_display(run=part.run)
         identity = None if part.links is None else part.links.identity
-        self.context = RunContext(part.run, f"{SCHEME}{self._socket_dir}/bus.sock", directory, part.agents, identity)
+        self.context = RunContext(
+            part.run,
+            f"{SCHEME}{self._socket_dir}/bus.sock",
+            directory,
+            part.agents,
+            identity,
+            realtime=wants_realtime(config, part.agents),
+        )
         self._links = part.links
         self.clock = WallClock()
         self.log = EventLog(directory / "launch.events.jsonl", "launch", self.clock.utc_us)
@@ -209,7 +216,7 @@ class Launcher(Services):
         self.announce("")
         for line in _introduction(config, context, reserved):
             self.display.print_line(line)
-        realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
+        realtime = context.realtime and is_realtime_permitted()
         self.log.write(
             "started",
             run=context.run,
@@ -248,7 +255,8 @@ class Launcher(Services):
         end_all(router, _ROUTER_STOP_S)
         self._reserved.release()
         shutil.rmtree(self._socket_dir, ignore_errors=True)
-        self.log.write("stopped", exit_codes={name: child.poll() for name, child in self.children.items()})
+        ended = [*self.children.values(), *self._shared]
+        self.log.write("stopped", exit_codes={child.name: child.poll() for child in ended})
 
     def recover(self, agent: int) -> Child:
         """Start an agent on the vehicle of an ended one; it records separately and can fly without a router."""

@@ -349,7 +349,8 @@ class FlightSupervisor:
             self._refuse(f"{child.name} could not start: it {child.how_it_ended()}")
         else:
             view.note = "dead"
-            self._fail("agent_died", f"{child.name} {child.how_it_ended()}; the others fly on")
+            others = "; the others fly on" if self._running() else ""
+            self._fail("agent_died", f"{child.name} {child.how_it_ended()}{others}")
 
     def _land(self, timeout_s: float) -> None:
         """Order all agents to land over the bus; by signal where the bus does not reach."""

@@ -27,7 +27,7 @@ from swarmctl.mavlink.signing.channel import CHECK_LINK, SigningChannel
 from swarmctl.mavlink.signing.recognition import SignedRecognition
 from swarmctl.mavlink.signing.stamp_file import kept_channel
 from swarmctl.ops.preflight import claim_ports
-from swarmctl.ops.processes import Child, RunContext, end_all, run_name, sitl_command
+from swarmctl.ops.processes import Child, RunContext, end_all, run_name, sitl_command, wants_realtime
 from swarmctl.signing_keys import read_keys
 from swarmctl.wall_clock import WallClock, monotonic_us
 
@@ -144,7 +144,13 @@ def _simulator(config: Config) -> Iterator[VehicleLinks]:
     directory = Path(tempfile.mkdtemp(prefix="swarm-check-"))
     children: list[Child] = []
     agents = tuple(range(config.swarm.agents))
-    context = RunContext(run_name(config.name), f"{SCHEME}{directory / 'bus.sock'}", directory, agents)
+    context = RunContext(
+        run_name(config.name),
+        f"{SCHEME}{directory / 'bus.sock'}",
+        directory,
+        agents,
+        realtime=wants_realtime(config, agents),
+    )
     try:
         children.append(Child(sitl_command(config, context, ports), directory))
         yield VehicleLinks(links, _SIMULATOR_S, children[0])

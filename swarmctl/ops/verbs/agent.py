@@ -52,6 +52,8 @@ def agent(
         raise ConfigError("--originals", [str(error)]) from error
     if len(set(ids)) < len(ids):
         raise ConfigError("--id", [f"{', '.join(map(str, ids))}: give each agent once"])
+    if len(ids) > 1 and (only_land or were):
+        raise ConfigError("--id", ["several agents neither only land nor set parameters back; start one for each"])
     if PARENT_ENV in os.environ:
         die_with_parent(signal.SIGTERM)
     processes = [

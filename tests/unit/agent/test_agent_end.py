@@ -31,6 +31,15 @@ def test_ends_are_read_as_they_come_and_a_line_only_when_it_is_whole() -> None:
     assert reader.end_of(2) is not None, "what was read is kept"
 
 
+def test_the_last_line_of_what_an_agent_says_is_told_as_of_a_process() -> None:
+    read_fd, write_fd = os.pipe()
+    write_end(write_fd, AgentEnd(agent=1, exit_code=2, words="a.toml: one problem\na.toml: another\n\n"))
+    os.close(write_fd)
+    end = EndReader(read_fd).end_of(1)
+    assert end is not None
+    assert end.words == "a.toml: another"
+
+
 def test_looking_for_an_end_does_not_wait() -> None:
     read_fd, write_fd = os.pipe()
     reader = EndReader(read_fd)
@@ -41,7 +50,9 @@ def test_looking_for_an_end_does_not_wait() -> None:
     assert reader.end_of(0) is None
 
 
-@pytest.mark.parametrize("words", ["\x1b" * 100_000, "é€😀" * 10_000, "\n" * 100_000])
+@pytest.mark.parametrize(
+    "words", ["\x1b" * 100_000, "\u202e" * 100_000, "\U000e0001" * 500, "é€😀" * 10_000, "\n" * 100_000]
+)
 def test_whatever_an_agent_says_is_one_line_that_a_pipe_takes_whole(words: str) -> None:
     read_fd, write_fd = os.pipe()
     write_end(write_fd, AgentEnd(agent=1, exit_code=1, words=words))

@@ -14,9 +14,9 @@ import pytest
 from swarmctl.agent import shared_process
 from swarmctl.agent.agent_end import AgentEnd
 from swarmctl.agent.runner import AgentProcess, Ending
-from swarmctl.agent.shared_process import Turns
+from swarmctl.agent.shared_process import Turns, run_agents
 from swarmctl.core.clock import SimClock
-from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
+from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START, ConfigError, MissionError, StartError
 
 PERIOD_US = 20_000
 TICK_US = 3_000
@@ -58,6 +58,10 @@ def silent() -> Ending:
 
 def broken() -> Ending:
     raise ZeroDivisionError("division by zero")
+
+
+def leaves() -> Ending:
+    raise SystemExit(7)
 
 
 class Scene:
@@ -131,6 +135,7 @@ def test_where_all_are_late_each_gets_its_turn(scene: Scene) -> None:
     [
         (silent, EXIT_MISSION, "vehicle at udpin://x: silent for 15 s"),
         (broken, 1, "ZeroDivisionError: division by zero"),
+        (leaves, 1, "SystemExit: 7"),
         (lambda: Ending(EXIT_START, "mission not completed: no"), EXIT_START, "mission not completed: no"),
     ],
 )
@@ -170,6 +175,28 @@ def test_the_end_of_one_delays_no_tick_of_another_and_is_told_when_all_is_closed
     assert scene.fly() == EXIT_OK
     assert other_is_done.is_set()
     assert {end.agent for end in scene.told} == {0, 1}
+
+
+def test_what_can_not_be_closed_is_no_success(scene: Scene) -> None:
+    def fails() -> None:
+        raise OSError("no space left on device")
+
+    scene.closes[0] = fails
+    scene.add(0, ticks=2)
+    scene.add(1, ticks=2)
+    assert scene.fly() == 1
+    assert scene.end_of(0) == AgentEnd(agent=0, exit_code=1, words="OSError: no space left on device")
+    assert scene.end_of(1).exit_code == EXIT_OK
+
+
+def test_agents_of_real_vehicles_do_not_take_turns(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    links = (f'{{sysid={n},url="udpin://127.0.0.1:{14540 + n}"}}' for n in (1, 2))
+    path.write_text(f"vehicles=[{','.join(links)}]\n[swarm]\nagents=2\n[sitl]\nenabled=false\n", encoding="utf-8")
+    both = [AgentProcess(config_path=path, agent=agent, run="", bus="none", run_dir=tmp_path) for agent in (0, 1)]
+    with pytest.raises(ConfigError, match="agents of real vehicles have processes of their own"):
+        run_agents(both)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_priority_is_asked_for_once_and_noted_by_every_agent(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,6 +65,10 @@ def test_agents_share_processes_as_they_are_told(
         (7, (), "swarm.agents_per_process=4 "),
         (12, (), "swarm.agents_per_process=6 "),
         (12, ("swarm.agents_per_process=6",), ""),
+        (12, ("swarm.agents_per_process=1",), "swarm.agents_per_process=6 "),
+        (12, ("swarm.agents_per_process=2",), ""),
+        (14, ("swarm.agents_per_process=2",), "swarmctl simulate"),
+        (20, (), "swarmctl simulate"),
     ],
 )
 def test_a_crowd_of_processes_is_warned_of(

@@ -123,8 +123,8 @@ def test_a_launch_is_ending_from_the_end_of_its_agents_until_its_report_is_writt
     services.announce("")
     services.stop(0.0)
     assert judged(Config(), services, LaunchResult()) == 0
-    agents, others, router, report = order
-    assert agents == "circle-1a"
+    agents, shared, others, router, report = order
+    assert agents == shared == "circle-1a"
     assert (others, router, report) == ("ending",) * 3
     with pytest.raises(StartError, match="no launch runs"):
         find_launch(None)
@@ -141,7 +141,7 @@ def test_an_end_that_can_not_be_announced_is_one_all_the_same(monkeypatch: pytes
     services.announce("")
     monkeypatch.setattr(launching, "announce", no_descriptor)
     services.stop(0.0)
-    assert len(ended) == 3, "agents, others, router"
+    assert len(ended) == 4, "agents, processes that they share, others, router"
 
 
 @pytest.mark.parametrize(
