@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 
@@ -13,6 +14,7 @@ from swarmctl.core.text import point_text
 
 _BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
 _AGENTS_SHOWN = 3
+_SAMPLES = 2000  # of a mission
 _SAME_M = 1e-6  # distances that differ by less are the same but for rounding
 _STEEP_RAD = 0.75  # a real PX4 has yawed at 44 degrees, and had no thrust left at 55
 _ZERO = np.zeros(1)
@@ -23,7 +25,8 @@ def config_warnings(config: Config) -> list[str]:
     unused = config.mission.unused_sections()
     kind = config.mission.kind
     found = [f"mission.{name} is set, mission.kind is {kind!r}: it is not flown" for name in unused]
-    return [*found, *_begin_elsewhere(config), *_judged_by_more_than_is_kept(config), *_turned_by_steep_tilt(config)]
+    judged = (*_judged_by_more_than_is_kept(config), *_stand_above_each_other(config))
+    return [*found, *_begin_elsewhere(config), *judged, *_seen_too_late(config), *_turned_by_steep_tilt(config)]
 
 
 def warning_lines(config: Config) -> list[str]:
@@ -77,6 +80,41 @@ def _judged_by_more_than_is_kept(config: Config) -> Iterator[str]:
         fails = f"the flight fails below limits.min_separation_m = {limit_m:g}"
         enough_m = math.ceil(100.0 * budget.radius_that_commits_m(limit_m) - 1e-6) / 100.0
         yield f"{keeps}, and {fails}; {enough_m:.2f} m keeps that"
+
+
+def _stand_above_each_other(config: Config) -> Iterator[str]:
+    """Yield which starts are apart by their heights alone, of vehicles that stand on the ground before and after."""
+    if config.sitl.enabled and config.sitl.start == "air":
+        return
+    limit_m, starts_ned_m = config.limits.min_separation_m, config.starts_ned_m()
+    for (i, a), (j, b) in itertools.combinations(enumerate(starts_ned_m), 2):
+        level_m = math.dist(a[:2], b[:2])
+        if level_m < limit_m - _SAME_M:
+            near = f"agents {i} and {j} start {level_m:.2f} m apart in the plane, and stand as near on the ground"
+            yield f"{near}: the flight fails below limits.min_separation_m = {limit_m:g}"
+
+
+def _seen_too_late(config: Config) -> Iterator[str]:
+    """Yield which obstacles on the way are seen too late for a stop before their keep-outs begin."""
+    if not config.obstacles:
+        return
+    starts_ned_m = np.array(config.starts_ned_m())
+    references = config.mission.references(starts_ned_m, config.separation.budget.planned_m)
+    t_s = np.linspace(0.0, config.mission.duration_s, _SAMPLES)
+    flown = [reference.sample(t_s) for reference in references]
+    for number, obstacle in enumerate(config.obstacles):
+        room_m = obstacle.visibility_m - obstacle.keep_out_m
+        for agent, (pos_ned_m, vel_ned_m_s) in enumerate(flown):
+            away_m = pos_ned_m - (np.array(obstacle.center_ned_m) + t_s[:, None] * np.array(obstacle.vel_ned_m_s))
+            near = np.linalg.norm(away_m[:, : 2 if obstacle.column else 3], axis=1) < obstacle.visibility_m
+            speed_m_s = float(
+                np.linalg.norm(vel_ned_m_s - np.array(obstacle.vel_ned_m_s), axis=1)[near].max(initial=0.0)
+            )
+            stop_m = speed_m_s**2 / (2.0 * config.controller.mpc.accel_max_m_s2(config.model_of(agent)))
+            if stop_m > room_m:
+                seen = f"obstacles.{number}: agent {agent} sees it {room_m:.2f} m before its keep-out"
+                yield f"{seen}, at {speed_m_s:.1f} m/s, from which it stops in {stop_m:.2f} m; raise visibility_m"
+                break
 
 
 def _turned_by_steep_tilt(config: Config) -> Iterator[str]:

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
+from swarmctl.agent.mission.start_conditions import StartConditions
 from swarmctl.config import load
+from swarmctl.control.phases import departure
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import ControlMode, Phase
 from tests.closed_loop.conftest import AT_100_HZ, COARSE, ROOT
 
@@ -131,3 +134,50 @@ def test_a_goto_on_the_way_down_does_not_sink_on() -> None:
     target = np.array([60.0, 0.0, begun_m])
     fly_until(flight, lambda: bool(np.linalg.norm(vehicle(flight)[0] - target) < 0.3), 90.0)
     assert max(float(row["pos_ned_m"][2]) for row in flight.truth if row["t_us"] > begun_us) < begun_m + 3.0
+
+
+BALL = Obstacle(center_ned_m=(0.3, 0.0, -3.0), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0)
+
+
+@pytest.mark.parametrize("waits", [True, False], ids=["waits", "negative control"])
+def test_a_climb_that_was_held_on_the_ground_waits_for_an_obstacle_that_has_come(
+    waits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its autopilot, which climbs, avoids nothing."""
+    if not waits:
+        monkeypatch.setattr(departure, "_obstacle_over", lambda *_: "")
+    flight = Lockstep(load(None, (*ON_GROUND_ALONE, "start.positions_ned_m=[[0,0,-5]]", "mission.kind=hover")))
+    fly_until(flight, lambda: phase(flight) is Phase.TAKEOFF)
+    flight.command("hold")
+    fly_for(flight, 1.0)
+    flight.set_obstacles([BALL])
+    fly_for(flight, 1.0)
+    flight.command("resume")
+    nearest_m = 100.0
+    for _ in range(200):
+        flight.step()
+        nearest_m = min(nearest_m, BALL.distance_m(vehicle(flight)[0]))
+    assert (nearest_m > BALL.keep_out_m) is waits
+    assert waits or nearest_m < BALL.radius_m
+
+
+@pytest.mark.parametrize("waits", [True, False], ids=["waits", "negative control"])
+def test_a_climb_that_was_held_on_the_ground_waits_for_a_vehicle_that_has_come(
+    waits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An operator has sent the other one to a point 1 m above it."""
+    if not waits:
+        monkeypatch.setattr(StartConditions, "_who_is_beside", lambda *_: "")
+    starts = "start.positions_ned_m=[[0,0,0.8],[1.2,0,-4]]"
+    flight = Lockstep(load(None, (*COARSE, "swarm.agents=2", starts, "mission.kind=hover", "mission.duration_s=3")))
+    fly_until(flight, lambda: phase(flight, 1) is Phase.TAKEOFF)
+    flight.command("hold", 1)
+    fly_until(flight, lambda: phase(flight, 0) is Phase.READY)
+    flight.command("goto", 0, north_m=1.2, east_m=0.0, down_m=0.95)
+    fly_for(flight, 3.5)
+    flight.command("resume", 1)
+    nearest_m = 100.0
+    for _ in range(125):
+        flight.step()
+        nearest_m = min(nearest_m, float(np.linalg.norm(vehicle(flight, 0)[0] - vehicle(flight, 1)[0])))
+    assert (nearest_m >= 0.85) is waits

@@ -127,6 +127,16 @@ def test_refused_in_one_line_with_key_value_and_what_is_allowed(
     assert "\n" not in text
 
 
+def test_weights_that_are_left_out_are_those_of_their_axis(tmp_path: Path) -> None:
+    path = file_with(tmp_path, "[controller.mpc.z]\nq_pos = 3.0\n")
+    config = load(path, ["controller.mpc.x.r=0.02", "agent.commit.follow_z.q_vel=0.6"])
+    mpc, follow_z = config.controller.mpc, config.agent.commit.follow_z
+    assert (mpc.z.q_pos, mpc.z.q_vel, mpc.z.r) == (3.0, 0.05, 1.0)
+    assert (mpc.x.q_pos, mpc.x.q_vel, mpc.x.r) == (1.5, 0.5, 0.02)
+    assert (follow_z.q_pos, follow_z.q_vel, follow_z.r) == (20.0, 0.6, 0.05)
+    assert "unknown key; known here: q_pos, q_vel, r" in refusals(path, "controller.mpc.z.q=1")[0]
+
+
 def test_agents_of_real_vehicles_share_no_process(tmp_path: Path) -> None:
     real = (
         "sitl.enabled=false",

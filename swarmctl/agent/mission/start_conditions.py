@@ -14,6 +14,7 @@ from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.control.reference.landing_places import nearest_in_plane_m
 from swarmctl.core.types import Array, Landed, Phase, VehicleState
 
+_WAITING = (Phase.STANDBY, Phase.ARM, Phase.TAKEOFF, Phase.READY)
 _START_ALERT_DELAY_US = 3_000_000  # time on the ground after which the unmet condition is raised as an alert
 _APART_FOR_US = 4_000_000  # estimates wander: vehicles have to be apart for as long as accuracy has to be steady
 
@@ -40,10 +41,11 @@ class StartConditions:
         state: VehicleState | None,
         others_ned_m: Callable[[], Sequence[Array]],
     ) -> str:
-        """Return why arming must wait, or "".
+        """Return why arming, or the climb that follows it, must wait, or "".
 
         The estimator still settles, or is too inaccurate for the separation, or another vehicle stands too close: the
-        autopilot, which climbs first, knows no peers.
+        autopilot, which climbs first, knows no peers. Between arming and the climb another one may come, where an order
+        or a lost link delays the climb.
 
         Args:
             now_us: monotonic time.
@@ -51,7 +53,11 @@ class StartConditions:
             state: newest one.
             others_ned_m: returns the position (3,) of each peer.
         """
-        if len(self._setup.starts_ned_m) == 1 or self._mission.phase > Phase.STANDBY:
+        if len(self._setup.starts_ned_m) == 1:
+            return ""
+        if self._mission.phase in (Phase.ARM, Phase.TAKEOFF):
+            return self._who_is_beside(state, others_ned_m)
+        if self._mission.phase > Phase.STANDBY:
             return ""
         self._accuracy.update(now_us, pos_accuracy_m)
         accuracy_m = self._accuracy.worst_m or 0.0  # if not reported, only body size and tracking error are checked
@@ -64,7 +70,15 @@ class StartConditions:
         if nearest_m < least_m:
             self._close_us = now_us
         is_close = self._close_us is not None and now_us - self._close_us < _APART_FOR_US
-        return f"{least_m:.2f} m to the next vehicle (now {nearest_m:.2f} m)" if is_close else ""
+        return _too_near(nearest_m, least_m) if is_close else ""
+
+    def _who_is_beside(self, state: VehicleState | None, others_ned_m: Callable[[], Sequence[Array]]) -> str:
+        """Return why a vehicle must not begin to climb now, at whatever height another one is beside it, or ""."""
+        if state is None or state.landed is not Landed.ON_GROUND:
+            return ""
+        least_m = self._setup.separation.budget.beside_climb_m(self._accuracy.worst_m or 0.0)
+        nearest_m = nearest_in_plane_m(state.pos_ned_m, others_ned_m())
+        return _too_near(nearest_m, least_m) if nearest_m < least_m else ""
 
     def too_slow(self, now_us: int, missed_01: float) -> str:
         """Return what the processor has to show before arming, in the rehearsals of STANDBY, or "".
@@ -103,10 +117,14 @@ class StartConditions:
 
     def report(self, now_us: int) -> None:
         """Raise the unmet condition as an alert once the agent has waited for a while; clear it once it is met."""
-        waits_for, may_wait = self._mission.waits_for, self._mission.phase in (Phase.STANDBY, Phase.READY)
+        waits_for, may_wait = self._mission.waits_for, self._mission.phase in _WAITING
         if not may_wait:
             self._waits_since_us = now_us
         if not (may_wait and waits_for):
             self._alerts.clear("start")
         elif now_us - self._waits_since_us > _START_ALERT_DELAY_US:
             self._alerts.put("start", f"waits for {waits_for}", now_us)
+
+
+def _too_near(nearest_m: float, least_m: float) -> str:
+    return f"{least_m:.2f} m to the next vehicle (now {nearest_m:.2f} m)"

@@ -12,10 +12,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from swarmctl.control.collision.half_spaces import half_spaces
 from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, stacked
@@ -32,8 +32,14 @@ from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Plan, PlanStatus
 
 
+def _may_be_left_out(schema: dict[str, Any]) -> None:
+    del schema["required"]
+
+
 class AxisWeights(Params):
-    """Sets the quadratic weights of one axis."""
+    """Sets the quadratic weights of one axis; their defaults are those of the section that has them."""
+
+    model_config = ConfigDict(json_schema_extra=_may_be_left_out)
 
     q_pos: float = Field(gt=0, le=1e4)  # weight of the position error
     q_vel: float = Field(ge=0, le=1e4)  # weight of the velocity error

@@ -41,6 +41,14 @@ def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[i
     return "the autopilot's answers" if inputs.busy else ""
 
 
+def unmet_climb_condition(inputs: PhaseInputs, state: VehicleState, top_ned_m: Array) -> str:
+    """Return what has come since STANDBY into the way of a climb to (3,) that has not begun, or "".
+
+    The autopilot that climbs avoids nobody, and an order or a lost link may have delayed it.
+    """
+    return (inputs.unsettled or _obstacle_over(inputs, top_ned_m)) if state.landed is Landed.ON_GROUND else ""
+
+
 def _obstacle_over(inputs: PhaseInputs, top_ned_m: Array) -> str:
     """Return which obstacle has to go before the autopilot, which avoids none, can climb to (3,), or ""."""
     obstacle = inputs.obstacle_below(top_ned_m, top_ned_m)

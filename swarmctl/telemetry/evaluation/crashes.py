@@ -1,4 +1,4 @@
-"""Finds vehicles that crashed while their agents flew them: they turned over, or touched the ground."""
+"""Finds vehicles that crashed: they turned over, or touched the ground while their agents flew them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.core.types import FLOWN_BY_AGENT, Phase
+from swarmctl.core.types import FLOWN_BY_AGENT, Mode, Phase
 from swarmctl.telemetry.evaluation.attitude import tilt_rad
 from swarmctl.telemetry.evaluation.tracks import Tracks
 
@@ -20,8 +20,8 @@ def crashes(
 ) -> Iterator[str]:
     """Yield what happened to each vehicle first, in words.
 
-    Only ticks count in which the agent flies, from its start position to its landing place: autopilots take off and
-    land, and pilots do as they like.
+    Who turns over crashes whoever flies it, from take-off to landing, but for pilots, who do as they like. The ground
+    counts only where the agent flies, from its start position to its landing place: autopilots take off and land.
 
     Args:
         ticks: by agent, rows of `TICK_DTYPE`.
@@ -30,14 +30,15 @@ def crashes(
         at_s: returns the mission time of an instant.
     """
     for agent, rows in sorted(ticks.items()):
+        in_air = rows[(rows["phase"] >= Phase.TAKEOFF) & (rows["phase"] < Phase.DONE)]
+        over = (tilt_rad(in_air["q_nb"]) > _OVER_RAD) & (in_air["mode"] != Mode.PILOT_OVERRIDE)
+        if over.any():
+            yield f"agent {agent} turned over at {at_s(float(in_air[tracks.time_field][np.argmax(over)])):.1f} s"
         flies = np.isin(rows["mode"], list(FLOWN_BY_AGENT))
         flown = rows[flies & (rows["phase"] >= Phase.READY) & (rows["phase"] <= Phase.GOTO_LAND)]
         if not len(flown):
             continue
         times_us = flown[tracks.time_field]
-        over = tilt_rad(flown["q_nb"]) > _OVER_RAD
-        if over.any():
-            yield f"agent {agent} turned over at {at_s(float(times_us[np.argmax(over)])):.1f} s"
         if ground_z_m is None or agent >= tracks.pos_ned_m.shape[1] or not len(tracks.t_us):
             continue
         instants = np.clip(np.searchsorted(tracks.t_us, times_us), 0, len(tracks.t_us) - 1)

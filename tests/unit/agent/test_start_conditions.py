@@ -27,7 +27,7 @@ SETUP = SimpleNamespace(
 
 
 @pytest.mark.parametrize(
-    ("phase", "waits_for"), [(Phase.ARM, "its estimator"), (Phase.TRACK, "agent-1"), (Phase.READY, "")]
+    ("phase", "waits_for"), [(Phase.GOTO_START, "its estimator"), (Phase.TRACK, "agent-1"), (Phase.READY, "")]
 )
 def test_an_agent_that_waits_no_longer_does_not_say_so(phase: Phase, waits_for: str) -> None:
     mission, alerts = SimpleNamespace(phase=Phase.STANDBY, waits_for="its estimator"), Alerts()
@@ -77,8 +77,13 @@ def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_w
     assert waits_for(5.1, 0.4) == "0.62 m to the next vehicle (now 0.40 m)"
     assert waits_for(9.0, 0.9) == "0.62 m to the next vehicle (now 0.90 m)"
     assert waits_for(9.2, 0.9) == ""
-    mission.phase = Phase.ARM
-    assert waits_for(9.3, 0.4) == "", "that is judged before"
+    for phase in (Phase.ARM, Phase.TAKEOFF):
+        mission.phase = phase
+        assert waits_for(9.3, 0.9) == ""
+        assert waits_for(9.4, 0.64) == "0.66 m to the next vehicle (now 0.64 m)", "it has come since"
+        assert waits_for(9.5, 0.9) == "", "and gone"
+    mission.phase = Phase.GOTO_START
+    assert waits_for(9.6, 0.4) == "", "an agent flies it, which avoids the other one"
 
 
 def test_an_agent_whose_processor_has_too_much_to_do_waits_until_it_keeps_up_for_a_while() -> None:

@@ -37,6 +37,27 @@ def test_commitments_that_keep_less_than_the_flight_is_judged_by_are_named() -> 
     assert lines(guaranteed, "separation.radius_m=0.95") == lines(guaranteed, "limits.min_separation_m=0.8") == []
 
 
+def test_starts_that_only_heights_keep_apart_are_named() -> None:
+    hover = ("swarm.agents=2", "mission.kind=hover", "start.positions_ned_m=[[0,0,-1],[0.7,0,-4]]")
+    (said,) = lines(*hover)
+    assert "agents 0 and 1 start 0.70 m apart in the plane" in said
+    assert "limits.min_separation_m = 0.85" in said
+    assert lines(*hover, "sitl.start=air") == []
+    assert lines(*hover[:2], "start.positions_ned_m=[[0,0,-1],[0.95,0,-4]]") == []
+
+
+@pytest.mark.parametrize(("speed_m_s", "is_named"), [(2.0, False), (10.0, True)])
+def test_an_obstacle_on_the_way_that_is_seen_too_late_is_named(speed_m_s: float, is_named: bool) -> None:
+    """At 10 m/s one was passed 0.33 m from its centre, of a radius of 1 m."""
+    goto = f"mission.goto={{goals_ned_m=[[60,0,0]],speed_m_s={speed_m_s},accel_m_s2=3}}"
+    alone = ("swarm.agents=1", "mission.kind=goto", goto, "start.positions_ned_m=[[0,0,0]]", "mission.duration_s=60")
+    on_the_way, aside = (f"obstacles=[{{center_ned_m=[30,{east},-1]}}]" for east in (0.1, 20.0))
+    said = lines(*alone, "sitl.start=air", on_the_way)
+    assert len(said) == is_named
+    assert all("obstacles.0: agent 0 sees it 1.25 m before its keep-out, at" in line for line in said)
+    assert lines(*alone, "sitl.start=air", aside) == []
+
+
 def test_real_vehicles_that_may_tilt_steeply_at_the_yaw_of_euler_angles_are_named() -> None:
     real = ("swarm.agents=1", "sitl.enabled=false", 'vehicles=[{url="udpin://127.0.0.1:14540",sysid=1}]')
     steep = "vehicle_model.tilt_max_rad=0.85"

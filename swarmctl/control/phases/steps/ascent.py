@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from swarmctl.control.phases import handover
+from swarmctl.control.phases.departure import unmet_climb_condition
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.mission_state import SPIN_UP_US, MissionState
 from swarmctl.control.phases.trajectories import is_at
@@ -36,8 +37,10 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
         else:
             handover.leave_control(mission, inputs)
         return []
+    mission.waits_for = unmet_climb_condition(inputs, state, mission.climb.rest_ned_m(state))
     if (
-        state.mode is not FlightMode.TAKEOFF
+        not mission.waits_for
+        and state.mode is not FlightMode.TAKEOFF
         and state.landed is Landed.ON_GROUND
         and mission.may_request(inputs, SPIN_UP_US)
     ):

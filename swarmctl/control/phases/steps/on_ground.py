@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from swarmctl.control.phases import handover
-from swarmctl.control.phases.departure import unmet_start_condition
+from swarmctl.control.phases.departure import unmet_climb_condition, unmet_start_condition
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
 from swarmctl.core.types import Command, FlightMode, Landed, Phase, VehicleState, Verb
@@ -47,7 +47,8 @@ def arm(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list
     too_late = "" if mission.airborne else _too_late(peer.phase for peer in inputs.peers().values())
     if refusal := inputs.refusal or too_late:
         return mission.refuse(refusal, inputs)
-    if not mission.may_request(inputs):
+    mission.waits_for = unmet_climb_condition(inputs, state, mission.climb.rest_ned_m(state))
+    if mission.waits_for or not mission.may_request(inputs):
         return []
     if inputs.arm_in not in (None, state.mode):
         return [Command(verb=Verb.EXTERNAL)]
