@@ -33,11 +33,11 @@ from swarmctl.core.types import Array, Plan, PlanStatus
 
 
 def _may_be_left_out(schema: dict[str, Any]) -> None:
-    del schema["required"]
+    del schema["required"]  # the section that has the weights has the defaults
 
 
 class AxisWeights(Params):
-    """Sets the quadratic weights of one axis; their defaults are those of the section that has them."""
+    """Sets the quadratic weights of one axis."""
 
     model_config = ConfigDict(json_schema_extra=_may_be_left_out)
 
