@@ -85,6 +85,8 @@ def _trials(options: argparse.Namespace) -> list[Trial]:
         if given:
             raise ConfigError("--quick", [f"{name}: leave it out, what is flown is fixed" for name in given])
         return list(QUICK)
+    if spaced := [item for item in options.sets if item.split() != [item]]:
+        raise ConfigError("--set", [f"{item!r}: write it without spaces" for item in spaced])
     found: list[Cell] = []
     for name in options.scenario:
         agents = options.agents or SCENARIOS[name].agents

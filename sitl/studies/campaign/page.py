@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -78,12 +79,18 @@ def _number(value: float | None, unit: str = "", digits: int = 2) -> str:
 
 def again(row: Row) -> str:
     """Return the command that flies a row again."""
-    sets = "".join(f" --set {item}" for item in row["sets"].split())
+    sets = "".join(f" --set {shlex.quote(item)}" for item in row["sets"].split())
     return (
-        f"swarmctl campaign --scenario {row['scenario']} --agents {row['agents']} --delay {row['delay_ms']:g} "
-        f"--loss {row['loss']:g} --noise {row['noise']} --wind {row['wind_m_s']:g} --protections {row['protections']} "
-        f"--airframe {row['airframe']} --disturbance {row['disturbance']}{sets} --first-seed {row['seed']} --trials 1"
+        f"swarmctl campaign --scenario {row['scenario']} --agents {row['agents']} --delay {_exact(row['delay_ms'])} "
+        f"--loss {_exact(row['loss'])} --noise {row['noise']} --wind {_exact(row['wind_m_s'])} "
+        f"--protections {row['protections']} --airframe {row['airframe']} --disturbance {row['disturbance']}{sets} "
+        f"--first-seed {row['seed']} --trials 1"
     )
+
+
+def _exact(value: float) -> str:
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
 
 
 _ALWAYS = ("agents", "delay", "loss", "protections", "collided", "arrived")

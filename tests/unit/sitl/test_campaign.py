@@ -217,6 +217,7 @@ def test_no_cluster_is_refused_in_words() -> None:
     ("arguments", "said"),
     [
         (["--set", "separation.radious_m=1"], "did you mean 'radius_m'"),
+        (["--set", "start.center_ned_m=[0, 0, -1]"], "'start.center_ned_m=[0, 0, -1]': write it without spaces"),
         (["--agents", "1"], "needs at least 2"),
         (["--scenario", "maze", "--agents", "60"], "would wait"),
         (["--quick", "--scenario", "maze"], "scenario: leave it out"),
