@@ -137,7 +137,7 @@ class Swarm:
         speed_m_s: float | None = None,
         far: bool = False,
     ) -> None:
-        """Fly one agent to a point, and hold there until `resume`; see `order`.
+        """Fly one agent to a point, and hold there until `resume`; see `order`, also for what is raised.
 
         Args:
             agent: its number.
@@ -146,6 +146,8 @@ class Swarm:
             speed_m_s: peak speed; None for `agent.state_machine.speed_m_s`.
             far: fly there though it is more than 500 m away.
         """
+        if len(point_ned_m) != len(POINT):
+            raise ConfigError("goto", [f"point_ned_m = {point_ned_m!r}: expected three numbers: {', '.join(POINT)}"])
         asked = dict(zip(POINT, map(float, point_ned_m), strict=True))
         chosen = {YAW: yaw_deg, SPEED: speed_m_s, FAR: 1.0 if far else None}
         self.order(GOTO, agent, **asked, **{name: value for name, value in chosen.items() if value is not None})
@@ -201,9 +203,12 @@ class Swarm:
         """Wait until every agent has reached a phase, for example "TRACK", or a later one.
 
         Raises:
+            ConfigError: there is no such phase.
             TimeoutError: not all of them have, after `timeout_s`.
             StartError: the launch has ended before.
         """
+        if phase not in Phase.__members__:
+            raise ConfigError("wait_for", [f"{phase!r} is no phase; those are {', '.join(Phase.__members__)}"])
         wanted, until_s = Phase[phase], time.monotonic() + timeout_s
         while True:
             phases = {agent: status["phase"] for agent, status in self.status().items()}

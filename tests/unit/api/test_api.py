@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import swarmctl
-from swarmctl.api.flight import _numbers
+from swarmctl.api.flight import Swarm, _numbers
 from swarmctl.api.flight_process import FlightProcess
 from swarmctl.config import Config
 from swarmctl.core.types import Phase
@@ -179,3 +179,12 @@ def test_agents_are_named_by_any_whole_numbers(agents: Any, numbers: list[int]) 
 def test_what_names_no_agent_is_refused_and_never_all(agents: Any) -> None:
     with pytest.raises(ConfigError, match="agents: "):
         _numbers(agents)
+
+
+def test_phases_and_points_that_are_none_are_refused_in_words(tmp_path: Path) -> None:
+    process: Any = None
+    swarm = Swarm(Config(), tmp_path, process)
+    with pytest.raises(ConfigError, match="'track' is no phase; those are CONNECT, STANDBY,"):
+        swarm.wait_for("track")
+    with pytest.raises(ConfigError, match=r"point_ned_m = \(1, 2\): expected three numbers: north_m, east_m, down_m"):
+        swarm.goto(0, (1, 2))
