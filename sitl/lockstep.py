@@ -28,6 +28,7 @@ from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.local.links import Impairments
 from swarmctl.bus.messages.json_messages import CommandMessage, EndedMessage, encode_message, first_list
 from swarmctl.bus.relay import RelayingBus
+from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.obstacle import Obstacle
@@ -167,7 +168,7 @@ class Lockstep:
             index,
             self._boot_id(index),
             self.links[index][0],
-            bus=bus,
+            bus=CountedBus(bus),
             clock=log.clock,
             sink=log,
             on_frame=log.frame,

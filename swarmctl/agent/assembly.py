@@ -9,7 +9,6 @@ import numpy as np
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.ports import Ports, TickSink
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.bus.bus import Bus
 from swarmctl.bus.topics import OPERATOR
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config
@@ -29,7 +28,7 @@ def make_agent(
     boot_id: int,
     transport: Transport,
     *,
-    bus: Bus,
+    bus: CountedBus,
     clock: Clock,
     sink: TickSink,
     on_frame: Callable[[bytes], None],
@@ -54,7 +53,7 @@ def make_agent(
     ports = Ports(
         autopilot=autopilot,
         commands=commands,
-        bus=CountedBus(bus),
+        bus=bus,
         clock=clock,
         sink=sink,
         stopwatch_ns=stopwatch_ns,

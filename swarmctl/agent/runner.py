@@ -25,6 +25,7 @@ from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.relay import RelayingBus
 from swarmctl.bus.silence import SessionWatch
+from swarmctl.bus.traffic import CountedBus
 from swarmctl.bus.zenoh_bus import NO_BUS
 from swarmctl.config import Config, load, own_identity
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
@@ -43,6 +44,7 @@ from swarmctl.process_lifetime import StopRequest
 from swarmctl.process_priority import request_realtime
 from swarmctl.signing_keys import read_own_key
 from swarmctl.telemetry.recording.recorder import Recorder
+from swarmctl.telemetry.recording.shared_events import SharedEvents
 from swarmctl.wall_clock import WallClock
 
 _LOOPBACK = "127.0.0.1"
@@ -182,8 +184,9 @@ def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> 
         opened.callback(transport.close)
         recorder = Recorder(process.run_dir, agent)
         opened.callback(recorder.close)
-        link = _join(process, config, clock)
+        link = CountedBus(_join(process, config, clock))
         opened.callback(link.close)
+        sink = SharedEvents(recorder, link, agent) if config.hosts else recorder
         flown = make_agent(
             config,
             agent,
@@ -191,7 +194,7 @@ def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> 
             transport,
             bus=link,
             clock=clock,
-            sink=recorder,
+            sink=sink,
             on_frame=lambda frame: recorder.frame(clock.utc_us(), frame),
             stopwatch_ns=time.perf_counter_ns,
             signing=signing,
@@ -199,10 +202,9 @@ def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> 
         )
 
         def note(name: str, **fields: Any) -> None:
-            recorder.event(name, clock.now_us(), clock.utc_us(), **fields)
+            sink.event(name, clock.now_us(), clock.utc_us(), **fields)
 
-        url = config.vehicles[agent].url if config.vehicles else ""
-        vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
+        vehicle = _vehicle_in_words(config, agent)
         sessions = SessionWatch(link, note)
         try:
             yield RealTimeAgent(
@@ -211,6 +213,11 @@ def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> 
         finally:
             for name, fields in flown.totals(recorder.lost).items():
                 note(name, **fields)
+
+
+def _vehicle_in_words(config: Config, agent: int) -> str:
+    url = config.vehicles[agent].url if config.vehicles else ""
+    return url or f"inherited socket of sysid {config.sysids()[agent]}"
 
 
 def _open_link(process: AgentProcess, config: Config, clock: WallClock, signing: SigningChannel | None) -> Transport:

@@ -21,7 +21,7 @@ from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.router import run_router
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
-from swarmctl.bus.topics import COMMAND, ENDED, MISSION, OBSTACLES, PATH, STATUS, Topic
+from swarmctl.bus.topics import COMMAND, ENDED, EVENT, MISSION, OBSTACLES, PATH, STATUS, Topic
 from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
 from swarmctl.errors import StartError
 from tests.benches.free_ports import free_ports
@@ -32,6 +32,7 @@ pytestmark = pytest.mark.process
 AGENTS = ("agent-0", "agent-1", "agent-2")
 SAID = (
     *((name, PATH) for name in AGENTS),
+    *((name, EVENT) for name in ("agent-1", "agent-2")),
     *((name, COMMAND) for name in ("alpha", "bravo", "charlie", STATION)),
     *((name, ENDED) for name in ("bravo", "charlie")),
     *((name, topic) for name in ("alpha", "charlie") for topic in (MISSION, OBSTACLES)),
@@ -45,7 +46,7 @@ MUTE = (
 )
 WITHOUT_DATAGRAMS = ("-c", MUTE + RUN)
 ROGUE_WITHOUT_DATAGRAMS = ("-c", OPEN + MUTE + RUN)
-OF_BRAVO = {("bravo", "agent-1", "path"), ("bravo", "bravo", "ended")}
+OF_BRAVO = {("bravo", "agent-1", "path"), ("bravo", "agent-1", "event"), ("bravo", "bravo", "ended")}
 LINK_S = 1.5
 WAIT_S = 20.0
 
@@ -107,7 +108,7 @@ def what_is_heard(swarm: SwarmOfHosts, by: tuple[str, ...], *, waits_for: dict[s
 
 
 def test_an_identity_brings_what_is_its_own_only(swarm: SwarmOfHosts) -> None:
-    own = {("charlie", "agent-2", "path"), ("charlie", "charlie", "ended")}
+    own = {("charlie", "agent-2", "path"), ("charlie", "agent-2", "event"), ("charlie", "charlie", "ended")}
     kept = {("charlie", "charlie", "obstacles")}  # by which alpha, an operator's, knows what charlie keeps clear of
     operators = {("alpha", "alpha", topic) for topic in ("command", "mission", "obstacles")}
     of_alpha = {("alpha", "agent-0", "path"), *operators}
@@ -139,7 +140,8 @@ def test_who_relays_passes_on_what_others_say(tmp_path: Path) -> None:
 
 def test_links_of_routers_do_not_carry_what_may_be_lost(swarm: SwarmOfHosts) -> None:
     """A link that waits for lost frames would bring paths seconds late."""
-    of_bravo, of_alpha = {("bravo", "bravo", "ended")}, {("alpha", "alpha", "command")}
+    of_bravo = {("bravo", "bravo", "ended"), ("bravo", "agent-1", "event")}
+    of_alpha = {("alpha", "alpha", "command")}
     with routers(swarm, lawless=("bravo",), rogue=WITHOUT_DATAGRAMS):
         heard = what_is_heard(swarm, ("alpha", "bravo"), waits_for={"alpha": of_bravo, "bravo": of_alpha})
     assert {said for said in heard["alpha"] if said[0] == "bravo"} == of_bravo

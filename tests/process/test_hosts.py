@@ -157,6 +157,11 @@ def test_two_hosts_fly_one_swarm_that_a_station_commands_and_judges(
         assert separation["min_m"] >= 0.85
         assert separation["min_pair"] == [0, 1]
         assert station.summary()["tracking"]["index_m"] is not None
+        for name in ("agent-0", "agent-1"):
+            assert {row["verb"] for row in station.events("operator", name)} >= {"hold", "resume", "land"}
+            assert len(station.events("bus_summary", name)) == 1, "the last events arrive too"
+        assert set(station.summary()["comms"]["sent"]) >= {"path", "status", "event"}
+        assert station.summary()["commitments"]["committed"] > 0
         assert [abs(clock["ahead_s"]) < 0.05 for clock in station.summary()["clocks"]] == [True, True], "one computer"
 
 

@@ -21,6 +21,7 @@ from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.messages.json_messages import StatusMessage, encode_message, first_list
 from swarmctl.bus.messages.path_messages import encode_path
+from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config, load
 from swarmctl.core.clock import SimClock
 from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
@@ -135,7 +136,7 @@ class Formation:
             0,
             1,
             near,
-            bus=hub.connect(agent_name(0)),
+            bus=CountedBus(hub.connect(agent_name(0))),
             clock=self.clock,
             sink=_Nowhere(),
             on_frame=lambda frame: None,

@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from swarmctl.bus.network.roster import Roster, Speaker
-from swarmctl.bus.topics import ANSWER, COMMAND, ENDED, MISSION, OBSTACLES, TOPICS
+from swarmctl.bus.topics import ANSWER, COMMAND, ENDED, EVENT, MISSION, OBSTACLES, TOPICS
 
 _LISTENING = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query", "query")
 _SPEAKING = ("put", "delete", "liveliness_token", "declare_queryable", "reply")
 _ALIVE = "alive"  # of liveliness tokens
 _LINKED = (*(topic.name for topic in TOPICS if topic.reliable), _ALIVE)  # what links of routers carry
-_OF_AGENTS = (ANSWER.name, _ALIVE)
+_OF_AGENTS = (ANSWER.name, EVENT.name, _ALIVE)
 _OF_CLIENTS = (*(topic.name for topic in TOPICS if not topic.reliable), *_OF_AGENTS)
 _OF_COMPUTERS = (ENDED.name, _ALIVE)
 _OF_OPERATORS = (COMMAND.name, MISSION.name, OBSTACLES.name)

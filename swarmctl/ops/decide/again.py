@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus.bus import agent_name
+from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config
 from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.types import Array, Phase, Plan, PlanStatus
@@ -99,7 +100,15 @@ def decide_again(
     sink, rows = _Rows(), run.ticks[agent]
     clock.t_us, clock.utc = int(rows["t_us"][0]), int(rows["utc_us"][0])
     flown = make_agent(
-        config, agent, _BOOT, link, bus=bus, clock=clock, sink=sink, on_frame=lambda _: None, stopwatch_ns=lambda: 0
+        config,
+        agent,
+        _BOOT,
+        link,
+        bus=CountedBus(bus),
+        clock=clock,
+        sink=sink,
+        on_frame=lambda _: None,
+        stopwatch_ns=lambda: 0,
     )
     from_vehicle = _InTime(frames)
     from_peers = _InTime(peer_messages(config, agent, run.ticks, plans))

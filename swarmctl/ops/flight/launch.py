@@ -23,7 +23,7 @@ from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.router_links import RouterLinks
 from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
-from swarmctl.bus.topics import ENDED, OBSTACLES, OPERATOR, STATUS, TICK, Topic
+from swarmctl.bus.topics import ENDED, EVENT, OBSTACLES, OPERATOR, STATUS, TICK, Topic
 from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, socket_file
 from swarmctl.config import Config, dump
 from swarmctl.configuration.config_warnings import launch_warning_lines
@@ -329,7 +329,7 @@ class Launcher(Services):
         senders = [agent_name(agent) for agent in range(self._config.swarm.agents)]
         listen: dict[Topic, Sequence[str]] = {STATUS: senders, OBSTACLES: list_keepers(context.identity)}
         if not context.agents:  # nobody records here, so the station does
-            listen[TICK] = senders
+            listen[TICK] = listen[EVENT] = senders
             listen[ENDED] = () if context.identity is None else context.identity.roster.hosts
         router = self.children[ROUTER]
         deadline_s = time.monotonic() + _BUS_S

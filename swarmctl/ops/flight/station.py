@@ -1,7 +1,7 @@
 """`swarmctl station`: shows, records and judges a swarm that flies from several computers, and lets verbs act on it.
 
-No agent needs it: it may start late, end early, or never be there. What it records are the reports of the agents, so
-it judges by estimates, as a launch over real vehicles does; it notes when they arrive, as their clocks may differ.
+No agent needs it: it may start late, end early, or never be there. What it records are the ticks and events of the
+agents, so it judges by estimates, as a launch over real vehicles does; it notes when ticks arrive, as clocks differ.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class SwarmWatch:
     """Shows and records agents that run elsewhere, and repeats the obstacles that operators set.
 
     Args:
-        bus: receives their statuses and ticks.
+        bus: receives their statuses, ticks and events.
         agents: size of the swarm.
         directory: run folder for what they report.
         display: shows them.
@@ -149,6 +149,7 @@ class SwarmWatch:
         now_s = self._clock_s()
         self._excuse_own_pause(now_s)
         self._record_ticks()
+        self._record_events()
         for status in self._report.statuses():
             if 0 <= status.agent < len(self._views):
                 self._take_status(self._views[status.agent], status, now_s)
@@ -172,6 +173,7 @@ class SwarmWatch:
             not_ended = [view for view in waited_for if not (_is_done(view) or self._has_ended(view, now_s))]
             self.is_over = bool(waited_for) and not not_ended
             self._conclude(self._lost(now_s, _SILENT_S), not_ended)
+        self._record_events()
         self._clocks.close()
         for recorder in self._recorders.values():
             recorder.close()
@@ -203,6 +205,10 @@ class SwarmWatch:
             if tick is not None:
                 self._recorders[sender].tick(tick[0], None)
                 self._clocks.received(self._numbers[sender], int(tick[0]["t_us"][0]), arrival_us)
+
+    def _record_events(self) -> None:
+        for sender, line in self._report.events():
+            self._recorders[sender].put_event(line)
 
     def _waited_for(self) -> list[AgentView]:
         """Return all but those without whom the others go on, and who have not flown after all."""

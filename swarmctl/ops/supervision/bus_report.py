@@ -9,9 +9,10 @@ from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import EndedMessage, StatusMessage, decode_status
 from swarmctl.bus.refusals import HARMLESS, IDENTITY, MALFORMED, Refusals
 from swarmctl.bus.silence import SessionWatch
-from swarmctl.bus.topics import ENDED, STATUS
+from swarmctl.bus.topics import ENDED, EVENT, STATUS
 from swarmctl.bus.vouched_ends import VouchedEnds
 from swarmctl.ops.supervision.status_table import Display
+from swarmctl.telemetry.recording.shared_events import taken_event
 from swarmctl.wall_clock import monotonic_us
 
 _REOPENED = "another session of the bus has taken over: the one before may have been deaf"
@@ -49,6 +50,15 @@ class BusReport:
                 self.refuse(sender, ENDED.name, refusal)
             if ended is not None:
                 yield ended
+
+    def events(self) -> Iterator[tuple[str, bytes]]:
+        """Yield the events of agents that have arrived, each with its sender and as it is recorded."""
+        for sender, payload in self._bus.receive(EVENT):
+            taken = taken_event(sender, payload)
+            if taken.refusal:
+                self.refuse(sender, EVENT.name, taken.refusal)
+            else:
+                yield sender, taken.line
 
     def step(self) -> None:
         """Report what is new: refused messages, the first of each kind in words, and another session."""

@@ -14,6 +14,7 @@ import struct
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,8 +71,11 @@ class Recorder:
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         """Record one event with its fields; events are rare, unlike ticks."""
-        row = {"utc_us": utc_us, "t_us": t_us, "source": self._source, "event": name, **fields}
-        self._put(2, to_json(row).encode() + b"\n")
+        self.put_event(event_line(self._source, name, t_us, utc_us, fields))
+
+    def put_event(self, line: bytes) -> None:
+        """Record one event that is a JSON object already, without line breaks."""
+        self._put(2, line + b"\n")
 
     def close(self, timeout_s: float = 2.0) -> None:
         """Write what is queued; after `timeout_s` of a hanging disk the remaining rows count as lost."""
@@ -101,6 +105,11 @@ class Recorder:
         for file_, rows in zip(self._files, batches, strict=True):
             if rows:
                 file_.append(rows)
+
+
+def event_line(source: str, name: str, t_us: int, utc_us: int, fields: Mapping[str, Any]) -> bytes:
+    """Return an event as the JSON object that is recorded of it."""
+    return to_json({"utc_us": utc_us, "t_us": t_us, "source": source, "event": name, **fields}).encode()
 
 
 class _RowFile:

@@ -20,15 +20,18 @@ from swarmctl.bus.messages.json_messages import (
     encode_message,
     first_list,
 )
-from swarmctl.bus.topics import ENDED, OBSTACLES, STATUS, TICK
+from swarmctl.bus.topics import ENDED, EVENT, OBSTACLES, STATUS, TICK
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
 from swarmctl.ops.flight.station import SwarmWatch
 from swarmctl.ops.supervision.status_table import PlainLines
+from swarmctl.telemetry.evaluation.referee import Rules, evaluate
 from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
+from swarmctl.telemetry.recording.run_files import load_run, read_events
 from swarmctl.wall_clock import WallClock
 from tests.builders import status_message
+from tests.unit.telemetry.test_referee import run, ticks
 
 BALL = Obstacle(center_ned_m=(5.0, 0.0, -2.0), radius_m=0.5, keep_out_m=1.0)
 
@@ -98,7 +101,8 @@ class Watched:
         names = [agent_name(agent) for agent in range(3)]
         self._agents = [self._hub.connect(name) for name in names]
         self._hosts = {name: self._hub.connect(name) for name in ("alpha", "bravo")}
-        bus = self._hub.connect("station", {STATUS: names, TICK: names, OBSTACLES: [], ENDED: [*self._hosts]})
+        hears = {STATUS: names, TICK: names, EVENT: names, OBSTACLES: [], ENDED: [*self._hosts]}
+        bus = self._hub.connect("station", hears)
         vouchers = {"alpha": {0, 2}, "bravo": {1}}
         self.said = StringIO()
         self.watch = SwarmWatch(
@@ -107,6 +111,11 @@ class Watched:
 
     def _note(self, event: str, **fields: Any) -> None:
         self.noted.append((event, fields.get("agents")))
+
+    def tell(self, agent: int, payload: bytes) -> None:
+        """Have an agent publish an event, or what is none."""
+        self._agents[agent].publish(EVENT, payload)
+        self.now_s += 0.2
 
     def end(self, agent: int, *, boot_id: int | None = 1, is_down: bool, host: str = "bravo") -> None:
         """Have a host say that a process has ended."""
@@ -354,3 +363,33 @@ def test_ctrl_c_of_a_flight_that_is_over_is_no_interruption(watched: Watched) ->
     watched.watch.close()
     assert (watched.watch.is_over, watched.watch.problems) == (True, [])
     assert watched.noted == [("flown_without", [1])]
+
+
+def test_the_judge_of_a_station_knows_of_missions_that_were_set_in_flight(watched: Watched, tmp_path: Path) -> None:
+    """Agent 1 says so in the name of agent 2, which has flown as short as it without being asked to."""
+    changed = {"utc_us": 6, "t_us": 5, "event": "mission_changed", "duration_s": 20.0}
+    for agent, source in ((0, "agent-0"), (1, "agent-2")):
+        watched.tell(agent, msgspec.json.encode(changed | {"source": source}))
+    assert not watched.run(0.2, ALL_TRACK)
+    watched.watch.close()
+    places = [(0.0, 0.0, 0.0), (3.0, 0.0, 0.0), (6.0, 0.0, 0.0)]
+    flown = run({agent: ticks(20, place) for agent, place in enumerate(places)}, events=load_run(tmp_path).events)
+    rules = Rules(agents=3, required_separation_m=0.5, duration_s=38.0)
+    assert evaluate(flown, rules, "completed")["violations"] == ["mission time 20.0 s of agent 2 below 38 s"]
+
+
+def test_events_that_arrive_as_the_station_ends_are_recorded(watched: Watched, tmp_path: Path) -> None:
+    watched.tell(1, b'{"utc_us": 6, "t_us": 5, "event": "bus_summary", "sent": {}}')
+    watched.watch.close()
+    assert [(row["source"], row["event"]) for row in read_events(tmp_path)] == [("agent-1", "bus_summary")]
+
+
+def test_what_is_no_event_is_counted_and_not_recorded(watched: Watched, tmp_path: Path) -> None:
+    for payload in (b"[]", b'{"utc_us": 6, "t_us": 5, "event": "started", "agents": [0, 1, 2]}'):
+        watched.tell(1, payload)
+    watched.watch.step()
+    watched.watch.close()
+    assert [event for event, _ in watched.noted if event != "not_ended"] == ["refused", "refused"]
+    refused = [f"event in the name of agent-1 refused: {why}" for why in ("malformed", "identity")]
+    assert [text for text in refused if text not in watched.said.getvalue()] == []
+    assert read_events(tmp_path) == []
