@@ -662,7 +662,6 @@ def test_a_vehicle_that_its_agent_flies_to_the_ground_or_that_turns_over_has_cra
     assert fallen(down_m=1.99) == ["agent 0 touched the ground in flight, at 5.0 s"]
     assert fallen(down_m=2.0, phase=Phase.GOTO_LAND) == fallen(down_m=2.0)
     assert fallen(down_m=2.0, tilt_rad=1.6, mode=Mode.PILOT_OVERRIDE) == []
-    lands = {"mode": Mode.IDLE, "phase": Phase.LAND}
-    assert fallen(down_m=2.0, **lands) == []
-    assert fallen(down_m=2.0, tilt_rad=1.6, **lands) == ["agent 0 turned over at 5.0 s"], "whoever lands it"
-    assert fallen(down_m=2.0, tilt_rad=1.6, mode=Mode.IDLE, phase=Phase.DONE) == [], "somebody may carry it"
+    assert fallen(Mode.IDLE, Phase.LAND, down_m=2.0) == []
+    assert fallen(Mode.IDLE, Phase.LAND, down_m=2.0, tilt_rad=1.6) == ["agent 0 turned over at 5.0 s"], "whoever lands"
+    assert fallen(Mode.IDLE, Phase.DONE, down_m=2.0, tilt_rad=1.6) == [], "somebody may carry it"
