@@ -10,13 +10,14 @@ import pytest
 from pymavlink.dialects.v20 import development as dialect
 
 from sitl.lockstep import Lockstep
+from swarmctl.agent.sensing import world_model
 from swarmctl.bus.peers import PeerPaths
 from swarmctl.control.mpc import judgement
 from swarmctl.control.mpc import swarm_mpc as mpc
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from swarmctl.mavlink.codec import Codec
 from tests.benches.broken_solver import break_solver
-from tests.closed_loop.conftest import COARSE, Fly, closer_than, mission_is_over
+from tests.closed_loop.conftest import COARSE, Fly, closer_than, fly_now, mission_is_over, mission_t_s
 
 AIR = "sitl.start=air"
 
@@ -82,6 +83,32 @@ def test_a_frozen_agent_is_landed_by_its_autopilot_and_never_retakes_control(fly
     assert re.fullmatch(
         r"overload: setpoints stopped 3.0 s \(7\d deadline misses, .*\): the autopilot took over", taken
     )
+
+
+PASSING = (
+    *("swarm.agents=4", "mission.kind=swap", "mission.swap.travel_s=6", "mission.duration_s=16", AIR),
+    "start.positions_ned_m=[[3,0,-3],[0,3,-3],[-3,0,-3],[0,-3,-3]]",
+)
+
+
+def dies_amid(victim: int) -> float:
+    """Return how close vehicles come when one agent of four is killed while they turn around another.
+
+    Starts are never shifted: only exactly symmetric ones make all four meet at 2.9 s.
+    """
+    return fly_now(
+        *PASSING, at={2.9: lambda running: running.kill(victim)}, until=lambda running: mission_t_s(running) > 5.5
+    ).separation_m()
+
+
+@pytest.mark.parametrize("victim", [1, 3])
+def test_others_keep_clear_of_where_the_last_attitude_takes_a_vehicle(
+    monkeypatch: pytest.MonkeyPatch, victim: int
+) -> None:
+    """Planned was to turn; the kept attitude leads straight among the others, who came to 0.15 to 0.21 m of it."""
+    assert dies_amid(victim) >= 0.75
+    monkeypatch.setattr(world_model, "without_setpoints", lambda path: path)
+    assert dies_amid(victim) < 0.48, "negative control: bodies touch where it is expected to turn as planned"
 
 
 def take_over(running: Lockstep) -> None:

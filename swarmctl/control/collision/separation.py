@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -22,6 +22,8 @@ from swarmctl.core.trajectory import Polylines, braking_displacement, braking_di
 from swarmctl.core.types import Array, PredictedPath
 
 _TINY_M = 1e-6
+_KEEPS_US = 600_000  # COM_OF_LOSS_T, which agents set to 0.5 s, and the time that the vehicle takes to level
+_MOST_M_S2 = 5.0  # of a kept acceleration: points are rounded, and second differences are sensitive to it
 _APPROACH_TOLERANCE_M = 0.02  # approach allowed in a whole encounter with a keep-out that is violated already
 
 
@@ -193,6 +195,21 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
         beyond_s = (k[:, tail:] - known.lasts) * steps_s
         found[:, tail:] += braking_displacements(known.last_legs() / steps_s, beyond_s, brake_m_s2)
     return found
+
+
+def without_setpoints(path: PredictedPath) -> PredictedPath:
+    """Return the path of a vehicle that has received no setpoint since it began to fly a path.
+
+    Its autopilot keeps the last attitude for a while, so the level acceleration of the first points goes on, instead of
+    what was planned to follow. Where the returned path ends the autopilot brakes, as beyond the end of any path.
+    """
+    first, second = path.pos_ned_m[:2]
+    bend = path.pos_ned_m[2] - 2.0 * second + first if len(path.pos_ned_m) > 2 else np.zeros(3)
+    bend[2] = 0.0
+    most_m, size_m = _MOST_M_S2 * (path.dt_us * 1e-6) ** 2, math.hypot(bend[0], bend[1])
+    bend *= most_m / max(size_m, most_m)
+    k = grid(max(1, round(_KEEPS_US / path.dt_us)))[:, None]
+    return replace(path, pos_ned_m=first + k * (second - first) + 0.5 * k * (k - 1.0) * bend)
 
 
 def keep_out_of_peer(

@@ -18,6 +18,7 @@ from swarmctl.control.collision.separation import (
     keep_out_of_peer,
     radius_problem,
     visible,
+    without_setpoints,
 )
 from swarmctl.core.obstacle import Obstacle
 from tests import builders
@@ -41,6 +42,27 @@ def test_beyond_its_end_a_peer_brakes_to_a_stop() -> None:
     # 3 t - 1.5 t^2 at 0, .25, .5, .75, 1 s: 0, .65625, 1.125, 1.40625, 1.5, then at rest
     np.testing.assert_allclose(aligned[:, 0], [1.5, 2.15625, 2.625, 2.90625, 3.0, 3.0, 3.0], atol=1e-12)
     np.testing.assert_allclose(aligned[:, 2], -2.0)
+
+
+def test_without_setpoints_the_first_level_acceleration_goes_on_and_then_it_brakes() -> None:
+    t_s = np.arange(6) * (DT_US * 1e-6)
+    turns = np.stack([2.0 * t_s, 0.5 * t_s**2, -2.0 - t_s**2], axis=1)
+    turns[3:] = turns[2]  # planned later on, and not flown
+    flown = align(without_setpoints(peer(turns)), UTC_US, 100_000, 20, brake_m_s2=3.0)
+    kept_s = 0.1 * np.arange(7)
+    np.testing.assert_allclose(flown[:7, 0], 2.0 * kept_s, atol=1e-12)
+    np.testing.assert_allclose(flown[:7, 1], 0.5 * kept_s**2, atol=1e-12)
+    np.testing.assert_allclose(np.diff(flown[:7, 2]), flown[1, 2] - flown[0, 2], atol=1e-12)
+    stopped_m = np.linalg.norm(flown[-1] - flown[6])
+    speed_m_s = np.linalg.norm(flown[6] - flown[5]) / 0.1
+    assert stopped_m == pytest.approx(speed_m_s**2 / 6.0), "braking from the velocity then reached"
+
+
+@pytest.mark.parametrize("points", [2, 3])
+def test_without_setpoints_no_more_acceleration_is_kept_than_a_vehicle_has(points: int) -> None:
+    jump = peer(np.array([[0.0, 0.0, -2.0], [0.0, 0.0, -2.0], [9.0, 0.0, -2.0]])[:points])
+    flown = align(without_setpoints(jump), UTC_US, 100_000, 6, brake_m_s2=3.0)
+    assert flown[-1, 0] <= 0.5 * 5.0 * 0.6**2
 
 
 def test_a_path_one_hour_old_has_stopped() -> None:
