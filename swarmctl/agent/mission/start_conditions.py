@@ -76,7 +76,7 @@ class StartConditions:
         """Return why a vehicle must not begin to climb now, at whatever height another one is beside it, or ""."""
         if state is None or state.landed is not Landed.ON_GROUND:
             return ""
-        least_m = self._setup.separation.budget.beside_climb_m(self._accuracy.worst_m or 0.0)
+        least_m = self._setup.separation.budget.standing_m(self._accuracy.worst_m or 0.0)
         nearest_m = nearest_in_plane_m(state.pos_ned_m, others_ned_m())
         return _too_near(nearest_m, least_m) if nearest_m < least_m else ""
 

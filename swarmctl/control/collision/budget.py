@@ -64,14 +64,9 @@ class SeparationBudget:
         Autopilots climb straight up, so what is required of a radius is enough here. Starts that are `radius_m` apart
         must not be waited for because estimates of rms `accuracy_m` are.
         """
-        return min(self.required_m(accuracy_m), self.beside_climb_m(accuracy_m))
-
-    def beside_climb_m(self, accuracy_m: float) -> float:
-        """Return the least level distance, by estimates of rms `accuracy_m`, from a vehicle that is about to climb.
-
-        Peers keep `radius_m` from its start where they fly by plans; whoever is nearer means to stay, or does not plan.
-        """
-        return self.radius_m - self.certify_slack_m - 2.0 * math.sqrt(2.0) * accuracy_m
+        return min(
+            self.required_m(accuracy_m), self.radius_m - self.certify_slack_m - 2.0 * math.sqrt(2.0) * accuracy_m
+        )
 
     @property
     def level_m(self) -> float:

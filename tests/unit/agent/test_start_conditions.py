@@ -80,7 +80,7 @@ def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_w
     for phase in (Phase.ARM, Phase.TAKEOFF):
         mission.phase = phase
         assert waits_for(9.3, 0.9) == ""
-        assert waits_for(9.4, 0.64) == "0.66 m to the next vehicle (now 0.64 m)", "it has come since"
+        assert waits_for(9.4, 0.6) == "0.62 m to the next vehicle (now 0.60 m)", "it has come since"
         assert waits_for(9.5, 0.9) == "", "and gone"
     mission.phase = Phase.GOTO_START
     assert waits_for(9.6, 0.4) == "", "an agent flies it, which avoids the other one"
