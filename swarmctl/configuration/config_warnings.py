@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from swarmctl.config import Config
 from swarmctl.control.reference.kinds.csv_table import CsvParams
+from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.text import point_text
 
 _BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
-_AGENTS_SHOWN = 3
+_SHOWN = 3
 _SAMPLES = 2000  # of a mission
 _SAME_M = 1e-6  # distances that differ by less are the same but for rounding
 _STEEP_RAD = 0.75  # a real PX4 has yawed at 44 degrees, and had no thrust left at 55
@@ -25,8 +26,10 @@ def config_warnings(config: Config) -> list[str]:
     unused = config.mission.unused_sections()
     kind = config.mission.kind
     found = [f"mission.{name} is set, mission.kind is {kind!r}: it is not flown" for name in unused]
+    references = config.mission.references(np.array(config.starts_ned_m()), config.separation.budget.planned_m)
+    flown = (*_begin_elsewhere(config, references), *_seen_too_late(config, references))
     judged = (*_judged_by_more_than_is_kept(config), *_stand_above_each_other(config))
-    return [*found, *_begin_elsewhere(config), *judged, *_seen_too_late(config), *_turned_by_steep_tilt(config)]
+    return [*found, *flown, *judged, *_turned_by_steep_tilt(config)]
 
 
 def warning_lines(config: Config) -> list[str]:
@@ -51,15 +54,13 @@ def unplayed(config: Config) -> Iterator[str]:
         yield f"{', '.join(asked)}: of lockstep only (`swarmctl simulate`); a launch flies with its links as they are"
 
 
-def _begin_elsewhere(config: Config) -> Iterator[str]:
+def _begin_elsewhere(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
     """Yield whose own reference begins away from where the agent waits, so that it has to catch up with it.
 
     References that agents share begin where they like.
     """
-    starts_ned_m = np.array(config.starts_ned_m())
-    references = config.mission.references(starts_ned_m, config.separation.budget.planned_m)
     found = []
-    for agent, (reference, start) in enumerate(zip(references, starts_ned_m, strict=True)):
+    for agent, (reference, start) in enumerate(zip(references, np.array(config.starts_ned_m()), strict=True)):
         begin = reference.sample(_ZERO)[0][0]
         away_m = float(np.linalg.norm(begin - start))
         if reference.fixed_in_time and not reference.jumps and away_m > _BEGINS_M:
@@ -67,9 +68,14 @@ def _begin_elsewhere(config: Config) -> Iterator[str]:
             found.append(f"agent {agent}: the reference begins {away_m:.2f} m from its start (at {places})")
     added = config.mission.kind == "csv" and config.mission.section(CsvParams).from_start
     hint = "; mission.csv.from_start adds positions to the start: begin at 0, 0, 0" if added else ""
-    yield from (f"{text}{hint}" for text in found[:_AGENTS_SHOWN])
-    if len(found) > _AGENTS_SHOWN:
-        yield f"{len(found) - _AGENTS_SHOWN} more references begin away from the agents' starts"
+    yield from _first([f"{text}{hint}" for text in found], "references begin away from the agents' starts")
+
+
+def _first(found: Sequence[str], others: str) -> Iterator[str]:
+    """Yield the first few of the texts found, and how many more there are, in words."""
+    yield from found[:_SHOWN]
+    if len(found) > _SHOWN:
+        yield f"{len(found) - _SHOWN} more {others}"
 
 
 def _judged_by_more_than_is_kept(config: Config) -> Iterator[str]:
@@ -86,30 +92,25 @@ def _stand_above_each_other(config: Config) -> Iterator[str]:
     """Yield which starts are apart by their heights alone, of vehicles that stand on the ground before and after."""
     if config.sitl.enabled and config.sitl.start == "air":
         return
-    limit_m, starts_ned_m = config.limits.min_separation_m, config.starts_ned_m()
-    for (i, a), (j, b) in itertools.combinations(enumerate(starts_ned_m), 2):
+    limit_m, found = config.limits.min_separation_m, []
+    for (i, a), (j, b) in itertools.combinations(enumerate(config.starts_ned_m()), 2):
         level_m = math.dist(a[:2], b[:2])
         if level_m < limit_m - _SAME_M:
             near = f"agents {i} and {j} start {level_m:.2f} m apart in the plane, and stand as near on the ground"
-            yield f"{near}: the flight fails below limits.min_separation_m = {limit_m:g}"
+            found.append(f"{near}: the flight fails below limits.min_separation_m = {limit_m:g}")
+    yield from _first(found, "pairs of agents stand as near")
 
 
-def _seen_too_late(config: Config) -> Iterator[str]:
+def _seen_too_late(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
     """Yield which obstacles on the way are seen too late for a stop before their keep-outs begin."""
-    if not config.obstacles:
-        return
-    starts_ned_m = np.array(config.starts_ned_m())
-    references = config.mission.references(starts_ned_m, config.separation.budget.planned_m)
     t_s = np.linspace(0.0, config.mission.duration_s, _SAMPLES)
-    flown = [reference.sample(t_s) for reference in references]
+    flown = [reference.sample(t_s) for reference in references if config.obstacles]
     for number, obstacle in enumerate(config.obstacles):
-        room_m = obstacle.visibility_m - obstacle.keep_out_m
+        room_m, center_ned_m = obstacle.visibility_m - obstacle.keep_out_m, obstacle.center_after(t_s[:, None])
         for agent, (pos_ned_m, vel_ned_m_s) in enumerate(flown):
-            away_m = pos_ned_m - (np.array(obstacle.center_ned_m) + t_s[:, None] * np.array(obstacle.vel_ned_m_s))
-            near = np.linalg.norm(away_m[:, : 2 if obstacle.column else 3], axis=1) < obstacle.visibility_m
-            speed_m_s = float(
-                np.linalg.norm(vel_ned_m_s - np.array(obstacle.vel_ned_m_s), axis=1)[near].max(initial=0.0)
-            )
+            sees = np.linalg.norm((pos_ned_m - center_ned_m)[:, : obstacle.axes], axis=1) < obstacle.visibility_m
+            towards_m_s = np.linalg.norm(vel_ned_m_s - np.array(obstacle.vel_ned_m_s), axis=1)
+            speed_m_s = float(towards_m_s[sees].max(initial=0.0))
             stop_m = speed_m_s**2 / (2.0 * config.controller.mpc.accel_max_m_s2(config.model_of(agent)))
             if stop_m > room_m:
                 seen = f"obstacles.{number}: agent {agent} sees it {room_m:.2f} m before its keep-out"

@@ -74,7 +74,12 @@ def wants_realtime(config: Config, agents: Sequence[int]) -> bool:
     """Return whether these agents are to have real-time priority and leave the processors some time for others."""
     if sys.platform != "linux":
         return False
-    return config.agent.realtime and len(agents) <= _AGENTS_PER_PROCESSOR * len(os.sched_getaffinity(0))
+    return config.agent.realtime and len(agents) <= _AGENTS_PER_PROCESSOR * _processors()
+
+
+def _processors() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def router_command(config: Config, context: RunContext, links: RouterLinks | None) -> Command:
@@ -125,7 +130,7 @@ def _shares(agents: int, most: int) -> list[range]:
 
 def crowding_warning(config: Config, agents: Sequence[int]) -> list[str]:
     """Return what to say where more agents have processes of their own than the processors can serve in time."""
-    processors = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    processors = _processors()
     processes = len(_shares(len(agents), config.swarm.agents_per_process))
     if not config.sitl.enabled or (processes <= _CROWDED * processors and len(agents) <= _CROWDED_SHARED * processors):
         return []

@@ -56,29 +56,35 @@ class StartConditions:
         if len(self._setup.starts_ned_m) == 1:
             return ""
         if self._mission.phase in (Phase.ARM, Phase.TAKEOFF):
-            return self._who_is_beside(state, others_ned_m)
+            return self._who_is_beside(state, others_ned_m, now_us, away_for_us=0)
         if self._mission.phase > Phase.STANDBY:
             return ""
         self._accuracy.update(now_us, pos_accuracy_m)
         accuracy_m = self._accuracy.worst_m or 0.0  # if not reported, only body size and tracking error are checked
         separation = self._setup.separation
         problem = self._accuracy.unsettled(now_us) or radius_problem(separation, accuracy_m, self._setup.drift_m)
-        if problem or state is None or state.landed is not Landed.ON_GROUND:
-            return problem
-        least_m = separation.budget.standing_m(accuracy_m)
-        nearest_m = nearest_in_plane_m(state.pos_ned_m, others_ned_m())
-        if nearest_m < least_m:
-            self._close_us = now_us
-        is_close = self._close_us is not None and now_us - self._close_us < _APART_FOR_US
-        return _too_near(nearest_m, least_m) if is_close else ""
+        return problem or self._who_is_beside(state, others_ned_m, now_us, away_for_us=_APART_FOR_US)
 
-    def _who_is_beside(self, state: VehicleState | None, others_ned_m: Callable[[], Sequence[Array]]) -> str:
-        """Return why a vehicle must not begin to climb now, at whatever height another one is beside it, or ""."""
+    def _who_is_beside(
+        self,
+        state: VehicleState | None,
+        others_ned_m: Callable[[], Sequence[Array]],
+        now_us: int,
+        *,
+        away_for_us: int,
+    ) -> str:
+        """Return why a vehicle on the ground must not climb, or "".
+
+        Another one, at whatever height, is beside it, or has not been away for so long.
+        """
         if state is None or state.landed is not Landed.ON_GROUND:
             return ""
         least_m = self._setup.separation.budget.standing_m(self._accuracy.worst_m or 0.0)
         nearest_m = nearest_in_plane_m(state.pos_ned_m, others_ned_m())
-        return _too_near(nearest_m, least_m) if nearest_m < least_m else ""
+        is_close = nearest_m < least_m
+        self._close_us = now_us if is_close else self._close_us
+        was_close = self._close_us is not None and now_us - self._close_us < away_for_us
+        return f"{least_m:.2f} m to the next vehicle (now {nearest_m:.2f} m)" if is_close or was_close else ""
 
     def too_slow(self, now_us: int, missed_01: float) -> str:
         """Return what the processor has to show before arming, in the rehearsals of STANDBY, or "".
@@ -124,7 +130,3 @@ class StartConditions:
             self._alerts.clear("start")
         elif now_us - self._waits_since_us > _START_ALERT_DELAY_US:
             self._alerts.put("start", f"waits for {waits_for}", now_us)
-
-
-def _too_near(nearest_m: float, least_m: float) -> str:
-    return f"{least_m:.2f} m to the next vehicle (now {nearest_m:.2f} m)"

@@ -283,7 +283,7 @@ class WorldModel:
         Somebody vouches for the end of its process, or it was heard done, and sends nothing to its vehicle any more. A
         missing liveliness token is none: the peer may be cut off.
         """
-        return self._ends.has_ended(agent, self._boot_id(agent)) or self._is_in(agent, Phase.DONE)
+        return self._has_died(agent) or self._is_in(agent, Phase.DONE)
 
     @property
     def ended(self) -> frozenset[int]:

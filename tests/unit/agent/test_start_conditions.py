@@ -77,13 +77,13 @@ def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_w
     assert waits_for(5.1, 0.4) == "0.62 m to the next vehicle (now 0.40 m)"
     assert waits_for(9.0, 0.9) == "0.62 m to the next vehicle (now 0.90 m)"
     assert waits_for(9.2, 0.9) == ""
-    for phase in (Phase.ARM, Phase.TAKEOFF):
+    for at_s, phase in ((9.3, Phase.ARM), (9.6, Phase.TAKEOFF)):
         mission.phase = phase
-        assert waits_for(9.3, 0.9) == ""
-        assert waits_for(9.4, 0.6) == "0.62 m to the next vehicle (now 0.60 m)", "it has come since"
-        assert waits_for(9.5, 0.9) == "", "and gone"
+        assert waits_for(at_s, 0.9) == ""
+        assert waits_for(at_s + 0.1, 0.6) == "0.62 m to the next vehicle (now 0.60 m)", "it has come since"
+        assert waits_for(at_s + 0.2, 0.9) == "", "and gone"
     mission.phase = Phase.GOTO_START
-    assert waits_for(9.6, 0.4) == "", "an agent flies it, which avoids the other one"
+    assert waits_for(9.9, 0.4) == "", "an agent flies it, which avoids the other one"
 
 
 def test_an_agent_whose_processor_has_too_much_to_do_waits_until_it_keeps_up_for_a_while() -> None:
