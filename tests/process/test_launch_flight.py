@@ -104,6 +104,14 @@ def test_a_killed_agent_is_named_and_the_others_finish(tmp_path: Path) -> None:
     assert 0 in {end.agent for end in scene.ended}, "the others need not wait for it"
 
 
+def test_nobody_is_said_to_fly_on_where_the_last_one_has_died(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [FLIES_LONG])
+    scene.act = lambda: scene.kill("agent-0")
+    scene.fly()
+    assert scene.printed("agent-0 was killed by SIGKILL")
+    assert not scene.printed("the others fly on")
+
+
 def test_ends_are_told_again_and_again_each_by_its_process(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [ends(0, 6.0), FLIES_LONG])
     scene.lands = ends(130, 1.5)

@@ -97,6 +97,7 @@ def test_there_is_one_link_for_each_pair_of_hosts_and_the_station_has_one_to_eac
 def test_the_name_of_the_run_follows_from_what_is_flown(path: Path) -> None:
     name = shared_run_name(load(path))
     assert shared_run_name(load(CONFIG)) == name, "folders differ from computer to computer"
+    assert shared_run_name(load(path, ["swarm.agents_per_process=2"])) == name, "so may how agents share processes"
     assert shared_run_name(load(path, ["separation.radius_m=1.0"])) != name
     assert shared_run_name(load(path, ["mission.swap.travel_s=9"])) != name
 

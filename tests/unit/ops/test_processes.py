@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -78,3 +79,12 @@ def test_a_crowd_of_processes_is_warned_of(
     lines = crowding_warning(load(None, (f"swarm.agents={agents}", *sets)), range(agents))
     assert len(lines) == bool(share)
     assert all(share in line for line in lines)
+
+
+@pytest.mark.parametrize("is_wanted", [True, False])
+def test_a_recovery_has_the_priority_of_its_launch(tmp_path: Path, is_wanted: bool) -> None:
+    """One agent alone would always be few enough, and compute before all that fly."""
+    config = load(None, ("swarm.agents=9",))
+    context = RunContext("run", "endpoint", tmp_path, tuple(range(9)), realtime=is_wanted)
+    (command,) = agent_commands(config, replace(context, agents=(3,)), ())
+    assert ("--realtime" in command.argv, "--no-realtime" in command.argv) == (is_wanted, not is_wanted)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +18,9 @@ from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS
 from sitl.studies.campaign.conditions.layouts import least_sum_m
 from sitl.studies.campaign.conditions.scenarios import SCENARIOS, layout_of
 from sitl.studies.campaign.flight import config_of, drawn
+from sitl.studies.campaign.page import again
 from sitl.studies.campaign.store import Store
-from sitl.studies.campaign.trials import SCHEMA, Cell, Row, Trial, cells
+from sitl.studies.campaign.trials import CELL_FIELDS, SCHEMA, Cell, Row, Trial, cells
 from sitl.studies.campaign.worker_pool import on_cluster, on_this_machine
 from swarmctl.bus import topics
 from swarmctl.bus.bus import agent_name
@@ -234,6 +236,16 @@ def test_cells_that_cannot_be_flown_are_refused_first(
 def test_a_value_that_is_given_twice_is_flown_once() -> None:
     asked = _parser().parse_args(["--scenario", "swap,swap", "--agents", "2,2", "--loss", "0,0.0", "--trials", "3"])
     assert [(trial.cell.agents, trial.seed) for trial in _trials(asked)] == [(2, 1), (2, 2), (2, 3)]
+
+
+def test_what_flies_a_trial_again_is_what_shells_take_and_exact() -> None:
+    sets = "obstacles=[{center_ned_m=[0,0,-1]}]"
+    cell = replace(CELL, delay_ms=50.0, loss=0.123456789, sets=sets)
+    values = {name: getattr(cell, name) for name in CELL_FIELDS}
+    arguments = shlex.split(again(values | {"seed": 7}))[2:]
+    assert _trials(_parser().parse_args(arguments)) == [Trial(cell, 7)]
+    assert "--delay 50 --loss 0.123456789 " in again(values | {"seed": 7})
+    assert f" --set {shlex.quote(sets)} " in again(values | {"seed": 7}), "shells expand braces"
 
 
 def test_a_partitioned_bus_delivers_nothing() -> None:
