@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -289,6 +290,20 @@ def test_router_ignores_ctrl_c_and_dies_with_a_killed_parent() -> None:
     parent.wait(WAIT_S)
     parent.stdout.close()
     assert until(lambda: not directory.exists()), "socket and directory are gone although nobody asked the router"
+
+
+def test_standard_output_of_a_router_ends_when_it_is_ready() -> None:
+    """Zenoh writes errors there: a router whose output nobody read blocked in the middle of one, and never ended."""
+    router = start_router(f"{SCHEME}{tempfile.mkdtemp(prefix='swarm-test-')}/bus.sock")
+    assert router.stdout is not None
+    try:
+        readable, _, _ = select.select([router.stdout], [], [], WAIT_S)
+        assert readable and router.stdout.read() == ""
+        assert router.poll() is None, "the output of a router that has ended ends too"
+    finally:
+        router.terminate()
+    assert router.wait(WAIT_S) == 0
+    router.stdout.close()
 
 
 def test_who_is_heard_can_change_in_flight(join: Callable[..., ZenohBus]) -> None:

@@ -39,13 +39,19 @@ if TYPE_CHECKING:
     from swarmctl.bus.network.datagram_links import DatagramLinks
 
 
-def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: bool = False) -> None:
+def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: bool = False) -> object:
     """Run the router until SIGTERM, which the caller has blocked, then remove the socket and its directory.
+
+    Standard output ends with the line that it is ready: Zenoh writes its errors there too, and blocks where they are
+    many and nobody reads them. They go to standard error.
 
     Args:
         endpoint: a Unix socket in a private directory.
         links: links to other computers; None: there are none.
         realtime: ask to be scheduled before other programs.
+
+    Returns:
+        What the caller keeps until the process ends: to destroy it waits for what closing it has waited for in vain.
 
     Raises:
         StartError: the endpoint is not a Unix socket in a private directory, another router holds it, or an address
@@ -66,12 +72,14 @@ def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: boo
     if realtime:
         request_realtime()
     print(f"router ready {endpoint}", flush=True)
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     signal.sigwait({signal.SIGTERM})
     if datagrams is None:
         close_within(session, CLOSE_DEADLINE_S)
     else:
         datagrams.close()
     remove_socket(socket_path)
+    return session, datagrams
 
 
 def _linked(links: RouterLinks | None) -> tuple[dict[str, Any], Callable[[Any], DatagramLinks | None]]:
@@ -131,7 +139,7 @@ def main() -> NoReturn:
         die_with_parent(signal.SIGTERM)
     code = EXIT_OK
     try:
-        run_router(options.endpoint, links, realtime=options.realtime)
+        _kept = run_router(options.endpoint, links, realtime=options.realtime)
     except SwarmError as error:
         print(error, file=sys.stderr)
         code = error.exit_code
