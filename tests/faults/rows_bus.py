@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from swarmctl.agent.planning import commitment_publisher, coordination
 from swarmctl.agent.planning.coordination import Coordination
+from swarmctl.agent.sensing import world_model
 from swarmctl.bus import peers
 from swarmctl.bus.local import inboxes
 from swarmctl.bus.peers import PeerPaths
@@ -145,12 +144,15 @@ ROWS = (
         event="the bus carries nothing for 10 s",
         reaction="all come to rest, and arrive once it does again",
         within_s=2.5,
-        protection="rest while peers are silent that may fly on, and margins that grow with age",
+        protection="rest while peers are silent that may fly on or have stopped, and margins that grow with age",
         happens=bus_fails(10.0),
         reacts=rests(range(4)),
         lasts_s=20.0,
         finally_={"they don't arrive": arrived},
-        off=replace(FLIES_ON, settings=("separation.age_accel_m_s2=0",)),
+        off=Off(
+            settings=("separation.age_accel_m_s2=0",),
+            patches=(*FLIES_ON.patches, (world_model, "without_setpoints", lambda path: path)),
+        ),
     ),
     SimulatedRow(
         name="bus-silent-10s-guaranteed",

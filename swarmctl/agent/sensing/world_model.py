@@ -35,6 +35,9 @@ from swarmctl.core.types import FLOWN_BY_AGENT, Array, FlightMode, Landed, Phase
 
 _COMPANY_US = 10_000_000  # a peer whose last status is older has left
 _SILENT_US = 2_000_000  # ten statuses; who is heard within it has not ended
+_EXPECTED_US = (
+    160_000  # whose path is older may fly another one: paths are shared each 0.1 s or more often, see `heartbeat_s`
+)
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 _STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
 _DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
@@ -182,7 +185,9 @@ class WorldModel:
             without: peers to leave out, because their committed trajectories are known.
         """
         params, budget, descends = self._params, self._budget, phase is Phase.GOTO_LAND
-        paths = [self._as_flown(path) for path in self.paths.near() if path.agent not in without]
+        near = (path for path in self.paths.near() if path.agent not in without)
+        ways = [(path, number) for known in near for number, path in enumerate(self._ways(known, t0_utc_us))]
+        paths = [path for path, _ in ways]
         places = aligned(paths, t0_utc_us, dt_us, steps, brake_m_s2=params.brake_m_s2) if paths else None
         found = [
             keep_out_along(
@@ -194,8 +199,9 @@ class WorldModel:
                 parked=self._is_parked(path.agent),
                 landing=descends or self._is_landing(path.agent),
                 here_ned_m=pos_ned_m,
+                way=number,
             )
-            for path, points in zip(paths, () if places is None else places, strict=True)
+            for (path, number), points in zip(ways, () if places is None else places, strict=True)
         ]
         seen = self.obstacles.see(pos_ned_m, t0_utc_us)
         if not seen:
@@ -222,7 +228,8 @@ class WorldModel:
             margin_m: distance added to the size of every body.
             committed_peers: trajectories that peers have committed to, by agent number.
         """
-        budget, fresh_us = self._budget, act_utc_us - round(self._params.lost_after_s * 1e6)
+        params, budget = self._params, self._budget
+        fresh_us = act_utc_us - round(params.lost_after_s * 1e6)
         found, committed_apart_m = list[Body](), budget.barrier_m(margin_m)
         for agent, trajectories in committed_peers.items():
             responsibility_01 = 0.5 if self._flies_itself(agent) else 1.0
@@ -233,16 +240,19 @@ class WorldModel:
         for path in self.paths.near():
             if path.agent in committed_peers:
                 continue
-            filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us and not self._has_died(path.agent)
+            filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
             age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
             age_margin_m = budget.age_margin_m(age_s, parked=self._is_parked(path.agent))
             apart_m = budget.barrier_peer_m(margin_m, path.margin_m, age_margin_m)
-            flown, brake_m_s2 = self._as_flown(path), self._params.brake_m_s2
-            body = body_of_peer(flown, act_utc_us, ahead_s, apart_m, filters=filters, brake_m_s2=brake_m_s2)
-            if age_s > self._params.lost_after_s:  # plans don't give way to its age either, see `keep_out_along`
-                least_m = budget.barrier_peer_m(margin_m, path.margin_m, 0.0)
-                body = replace(body, apart_m=not_driving_away_m(apart_m, math.dist(body.pos_ned_m, pos_ned_m), least_m))
-            found.append(body)
+            least_m = budget.barrier_peer_m(margin_m, path.margin_m, 0.0)
+            for way in self._ways(path, act_utc_us):
+                body = body_of_peer(
+                    way, act_utc_us, ahead_s, apart_m, filters=filters and way is path, brake_m_s2=params.brake_m_s2
+                )
+                if age_s > params.lost_after_s:  # plans don't give way to its age either, see `keep_out_along`
+                    apart_now_m = math.dist(body.pos_ned_m, pos_ned_m)
+                    body = replace(body, apart_m=not_driving_away_m(apart_m, apart_now_m, least_m))
+                found.append(body)
         apart_m = budget.barrier_obstacle_m(margin_m)
         seen = self.obstacles.visible(pos_ned_m, act_utc_us)
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in seen.values()]
@@ -251,15 +261,21 @@ class WorldModel:
         """Return whether somebody vouches for the end of a peer's process: its vehicle gets no setpoint any more."""
         return self._ends.has_ended(agent, self._boot_id(agent))
 
-    def _as_flown(self, path: PredictedPath) -> PredictedPath:
-        """Return the path by which a peer is predicted: its newest, without setpoints where its process has ended.
+    def _ways(self, path: PredictedPath, utc_us: int) -> tuple[PredictedPath, ...]:
+        """Return the paths by which a peer is predicted: its newest, the one without setpoints, or both.
 
-        One that is merely silent may fly on as it planned. Expected without setpoints 0.3 s after its last path, others
-        came to less than 0.85 m of it from one start in five.
+        Where its process has ended, the vehicle gets no setpoint. One that is merely silent may fly on as it planned,
+        or have stopped: expected in one way alone, others came to 0.17 m of it in the other.
         """
-        if not self._has_died(path.agent) or not self._flies_itself(path.agent) or self._is_parked(path.agent):
-            return path
-        return without_setpoints(path)
+        agent = path.agent
+        if not self._flies_itself(agent) or self._is_parked(agent):
+            return (path,)
+        if self._has_died(agent):
+            return (without_setpoints(path),)
+        oldest_us = utc_us - _EXPECTED_US
+        if path.t0_utc_us >= oldest_us or all(late.agent != agent for late in self.paths.late(oldest_us)):
+            return (path,)
+        return path, without_setpoints(path)
 
     def exclude(self, agent: int) -> None:
         """Believe that the process of a peer has ended; another process under its number takes part again."""

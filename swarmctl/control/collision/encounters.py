@@ -8,7 +8,7 @@ therefore measured against the distance at which the encounter began.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 
 from swarmctl.control.collision.separation import KeepOut, KeepOuts, stacked
@@ -19,11 +19,11 @@ class Encounters:
     """Remembers the distance at which each keep-out has been entered, until it is left."""
 
     def __init__(self) -> None:
-        self._entered_m: dict[int, float] = {}  # by `KeepOut.key`
+        self._entered_m: dict[Hashable, float] = {}  # by `KeepOut.key`
 
     def noted(self, keep_outs: Sequence[KeepOut], pos_ned_m: Array) -> KeepOuts:
         """Return the keep-outs of this tick; those that the position (3,) violates say where they were entered."""
-        known, entered_m = stacked(keep_outs), dict[int, float]()
+        known, entered_m = stacked(keep_outs), dict[Hashable, float]()
         if known:
             ways_m = (pos_ned_m - known.pos_ned_m[:, 0]).tolist()
             for keep_out, (north_m, east_m, down_m) in zip(known, ways_m, strict=True):

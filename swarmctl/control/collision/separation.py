@@ -8,7 +8,7 @@ last expected to stop. `half_spaces` makes constraints of the MPC from keep-outs
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -76,7 +76,7 @@ class KeepOut:
     any_height: bool  # a vertical cylinder instead of a sphere
     priority_id: int  # agent number, -1 an obstacle; decides the side when centres coincide
     downwash: float = 1.0  # ratio of height to width of the ellipsoid; 1 is a sphere
-    key: int | None = None  # the same in all ticks; None: encounters with it are not remembered
+    key: Hashable = None  # the same in all ticks; None: encounters with it are not remembered
     entered_m: float | None = None  # distance at which the present violation began; None: with this tick
 
     @property
@@ -245,10 +245,12 @@ def keep_out_along(
     parked: bool,
     landing: bool,
     here_ned_m: Array | None = None,
+    way: int = 0,
 ) -> KeepOut:
     """Return the keep-out of one peer whose positions (steps+1, 3) from `t0_utc_us` on are known already.
 
     Otherwise as `keep_out_of_peer`; `budget` is that of `params`, `here_ned_m` (3,) the own position; None if unknown.
+    Where a peer may take several ways, each has a keep-out, and `way` tells it from the others.
 
     Where a path is older than `lost_after_s`, its margin of age makes the radius no larger than the present distance:
     it keeps this agent from coming closer, and does not drive it away. The silent peer may hear this agent, and count
@@ -266,7 +268,7 @@ def keep_out_along(
         any_height=landing or (age_s > params.lost_after_s and not parked),
         priority_id=path.agent,
         downwash=params.downwash,
-        key=path.agent,
+        key=(path.agent, way),
     )
 
 

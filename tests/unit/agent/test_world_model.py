@@ -155,11 +155,13 @@ def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height
     utc_us = bench.clock.utc_us()
     assert bench.world_model.has_unresponsive_peer(utc_us)
     far_ned_m = np.array([5.0, 0.0, 0.0])
-    (kept,) = bench.world_model.keep_outs(HERE + far_ned_m, utc_us, 100_000, 5, phase=Phase.TRACK)
+    kept, stopped = bench.world_model.keep_outs(HERE + far_ned_m, utc_us, 100_000, 5, phase=Phase.TRACK)
+    assert stopped.any_height and stopped.radius_m == kept.radius_m, "it may fly as it planned, or have stopped"
+    assert stopped.key != kept.key
     assert kept.any_height and kept.radius_m > SeparationParams().radius_m + 0.9
-    (kept,) = bench.world_model.keep_outs(HERE + 0.3 * far_ned_m, utc_us, 100_000, 5, phase=Phase.TRACK)
+    kept, _ = bench.world_model.keep_outs(HERE + 0.3 * far_ned_m, utc_us, 100_000, 5, phase=Phase.TRACK)
     assert kept.radius_m == pytest.approx(1.5), "who is nearer comes no closer, and is not driven away"
-    (kept,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
+    kept, _ = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
     assert kept.radius_m == pytest.approx(SeparationParams().radius_m)
     assert bench.world_model.refusals.alert(utc_us) == "path of agent-1 refused: future"
     assert bench.unresponsive == [{"event": "unresponsive", "agent": 1, "begins": True}]
@@ -169,6 +171,24 @@ def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height
     assert not bench.world_model.has_unresponsive_peer(bench.clock.utc_us())
     assert bench.unresponsive[1]["begins"] is False
     assert bench.unresponsive[1]["lasted_s"] == pytest.approx(2.0, abs=0.1)
+
+
+def test_who_has_just_come_within_reach_is_expected_on_its_path_alone() -> None:
+    """Of those out of reach, paths are heard now and then: an old one is no silence."""
+    bench = Bench()
+    bench.say_path()
+    bench.say_status(phase=int(Phase.TRACK))
+    bench.tick()
+
+    def kept() -> int:
+        return len(bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 5, phase=Phase.TRACK))
+
+    assert kept() == 1
+    bench.clock.advance(300_000)
+    assert kept() == 2
+    bench.world_model.paths.attend([], bench.clock.utc_us())
+    bench.world_model.paths.attend([1], bench.clock.utc_us())
+    assert kept() == 1
 
 
 @pytest.mark.parametrize(("peers", "silent_s"), [(1, 0.5), (2, 0.3)])
@@ -499,7 +519,7 @@ def test_the_margin_of_who_is_done_grows_with_age_while_its_vehicle_moves(
 
     def apart_m() -> float:
         there = HERE + np.array([9.0, 0.0, 0.0])
-        (body,) = bench.world_model.bodies(there, bench.clock.utc_us(), 0.1, 0.1, committed_peers={})
+        body, *_ = bench.world_model.bodies(there, bench.clock.utc_us(), 0.1, 0.1, committed_peers={})
         return body.apart_m
 
     before_m = apart_m()
