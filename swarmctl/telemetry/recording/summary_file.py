@@ -59,9 +59,16 @@ class _Solver(msgspec.Struct):
     retry: str = ""  # missing in older folders
 
 
+class _Unresponsive(msgspec.Struct):
+    count: _Count = 0
+    longest_s: _Figure | None = None
+    agent: Annotated[int, msgspec.Meta(ge=0, lt=1000)] | None = None
+
+
 class _Comms(msgspec.Struct):
     path_age_ms: _Percentiles
     rejected: dict[str, _Count]
+    unresponsive: _Unresponsive | None = None  # missing in older folders
 
 
 class _Deadlocks(msgspec.Struct):

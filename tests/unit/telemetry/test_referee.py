@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,9 @@ from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunData, evaluate
 from swarmctl.telemetry.evaluation.tracks import merge_tracks, track_error, unseen_spans
 from swarmctl.telemetry.json_safe import to_json
+from swarmctl.telemetry.recording.summary_file import decode_summary
+from swarmctl.telemetry.report import run_report
+from swarmctl.telemetry.report.run_report import summary_rows
 
 UTC0_US = 1_780_000_000_000_000
 START_US = 1_000_000  # monotonic time of mission start
@@ -639,6 +644,27 @@ def test_summary_holds_no_nan_and_every_contract_key(data: RunData) -> None:
         "unresponsive",
         "reopened",
     }
+
+
+def test_the_report_of_a_summary_that_was_written_has_the_rows_of_the_run() -> None:
+    obstacle = JudgedObstacle(number=1, obstacle=Obstacle(center_ned_m=(9.0, 0.0, 0.0), radius_m=1.0))
+    rules = Rules(agents=2, required_separation_m=0.5, obstacles=(obstacle,), goals_ned_m=((1.0, 0.0, 0.0), None))
+    events = [
+        {"event": "unresponsive", "source": "agent-0", "agent": 1, "utc_us": 10_000_000, "begins": True},
+        {"event": "unresponsive", "source": "agent-0", "agent": 1, "utc_us": 12_500_000, "lasted_s": 2.5},
+        {"event": "deadlock", "source": "agent-0", "begins": True},
+        {"event": "deadlock", "source": "agent-0", "lasted_s": 1.5},
+        {"event": "controller_summary", "source": "agent-0", "controller": "own", "flown_ticks": 3, "mission_ticks": 4},
+        refused(0, "late", 2, "agent-1", "path"),
+        {"event": "bus_summary", "source": "agent-0", "rejected": {"late": 2}},
+    ]
+    summary = evaluate(run(APART, events=events), rules, "completed", speed_factor=3.0)
+    summary["clocks"] = [{"id": 0, "ahead_s": 0.0}, {"id": 1, "ahead_s": 0.5}]
+    rows = list(summary_rows(summary, rules))
+    assert list(summary_rows(decode_summary(to_json(summary).encode()), rules)) == rows
+    everything = set(re.findall(r'(?:SummaryRow|_least)\(\s*f?"([^"{]+)', inspect.getsource(run_report)))
+    shown = [row.name for row in rows]
+    assert [name for name in everything if not any(row.startswith(name) for row in shown)] == []
 
 
 GROUNDED = Rules(agents=1, required_separation_m=0.5, ground_z_m=2.0)
