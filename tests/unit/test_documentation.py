@@ -19,6 +19,7 @@ from swarmctl.control.reference.mission import GROUP as MISSIONS_OFFERED
 from swarmctl.core.operator_verbs import OPERATOR_VERBS
 from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Phase
+from swarmctl.ops.supervision.supervisor import ESSENTIAL_ENDED
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -51,9 +52,10 @@ def test_every_recorded_column_is_described() -> None:
 
 def test_every_event_is_described() -> None:
     code = "".join(path.read_text() for path in (ROOT / "swarmctl").rglob("*.py"))
-    events = re.findall(r"\b(?:_note|_say|_fail|log\.write|recorder\.event)\(\s*\"(\w+)\"", code)
-    assert len(events) > 30
-    assert set(events) - described() == set()
+    calls = (r'\b(?:_?note|_say|_fail|_announce|\w*\.event|log\.write)\(\s*"(\w+)"', r'tell\([^()"]*"(\w+)"')
+    events = {event for call in calls for event in re.findall(call, code)}
+    assert len(events) > 55
+    assert (events | set(ESSENTIAL_ENDED.values())) - described() == set()
 
 
 def test_the_height_of_the_simulated_ground_is_told_where_heights_are() -> None:

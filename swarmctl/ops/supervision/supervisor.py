@@ -35,6 +35,8 @@ from swarmctl.telemetry.recording.event_log import EventLog
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.wall_clock import WallClock
 
+ESSENTIAL_ENDED = {ROUTER: "router_ended", SITL: "sitl_ended"}  # event of the end of each essential process
+
 _STEP_S = 0.05
 _FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
 _VEHICLE_S = 90.0  # timeout for every agent to receive its vehicle
@@ -186,7 +188,8 @@ class FlightSupervisor:
         router = self._services.children.get(ROUTER)
         if router is not None and router.poll() is not None and self._router_starts < _ROUTER_STARTS:
             self._router_starts += 1
-            self._announce("router_ended", f"router {router.how_it_ended()}; it is started again, the flight goes on")
+            text = f"router {router.how_it_ended()}; it is started again, the flight goes on"
+            self._announce(ESSENTIAL_ENDED[ROUTER], text)
             try:
                 self._services.restart_router()
             except (StartError, OSError) as error:
@@ -197,7 +200,7 @@ class FlightSupervisor:
                 self._essential_lost = True
                 self._vehicles_lost |= name == SITL
                 self._result.could_not_start |= not any(view.status for view in self._views)
-                self._fail(f"{name}_ended", f"{name} {child.how_it_ended()}; landing. See {child.log}")
+                self._fail(ESSENTIAL_ENDED[name], f"{name} {child.how_it_ended()}; landing. See {child.log}")
                 self._land(land_s)
 
     def _watch_agents(self) -> None:
