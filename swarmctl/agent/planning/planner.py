@@ -100,8 +100,10 @@ class Planner:
         return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=list(keep_outs))
 
     def reset(self) -> None:
-        """Forget what the controller remembers: until now the vehicle was flown by its autopilot."""
+        """Forget what the controllers remember: until now the vehicle was flown by its autopilot."""
         self.controller.reset()
+        if self._transit is not self.controller:
+            self._transit.reset()
 
     def _keep_outs(self, state: VehicleState, start: Start) -> KeepOuts:
         """Return what to keep clear of from the start of the plan on."""
