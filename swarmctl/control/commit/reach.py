@@ -3,10 +3,10 @@
 In a large swarm most peers are too far away to matter. Each message of an agent declares which peers are *far*. The
 acknowledgement of all others is always required, and that of a far peer j unless
 
-1. j has said that it has heard, within the last `LEASE_US`, a message that declared it far;
+1. j has said that it has heard, within the last `FAR_LEASE_US`, a message that declared it far;
 2. the proposal is *modest*: no faster than the speed v, nor longer than the stretch L, that the agent's messages state;
 3. the proposal keeps the committed distance, with all its points, to the ball around the place where j was when it sent
-   the newest message known, of the radius v_j min(age, LEASE_US) + L_j.
+   the newest message known, of the radius v_j min(age, FAR_LEASE_US) + L_j.
 
 v_j and L_j are stated in that message. They bound what j has committed to or proposes in it, too, so what is clear of
 the ball is clear of those.
@@ -17,8 +17,9 @@ a, or A b, the proof is that of the protocol, which takes no more than one of th
 acknowledgement of B and B without that of A, and let A have been the later one to check condition 3, on a message m of
 B. From its place in m to where it proposed b, B has come along trajectories that it was committed to or proposed in m,
 or has committed to since. Of the latter, those that A has acknowledged were proposed in m at the latest, as A knows
-nothing newer. For the others, and for b, B did without A, by condition 1 for `LEASE_US` after m at most. Along all of
-them it was no faster than the v_B that m states, and b is no longer than its L_B. So b lies in the ball, and a outside.
+nothing newer. For the others, and for b, B did without A, by condition 1 for `FAR_LEASE_US` after m at most. Along all
+of them it was no faster than the v_B that m states, and b is no longer than its L_B. So b lies in the ball, and a
+outside.
 
 An excluded peer owes nothing as long as its newest message known does not declare the agent far: it commits to nothing
 without the agent then. Otherwise proposals keep clear of its ball. From the promise to exclude it on, no message says
@@ -41,7 +42,9 @@ from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import ANYWHERE, Reach, TrajectoryMessage
 from swarmctl.core.types import Array
 
-LEASE_US = 1_500_000
+# A message to all goes out every 0.5 s at least: an answer takes two of these, and a third may be lost. Longer, and the
+# balls that proposals have to keep clear of grow by a peer's speed.
+FAR_LEASE_US = 1_500_000
 _LOOKING_US = 100_000  # how often it is looked who is far
 _COMING_M, _LEAVING_M = 1.0, 1.5  # peers this much beyond where they have to acknowledge are near already, or still
 _EVERY = 3  # points of trajectories that are looked at for this
@@ -201,12 +204,12 @@ class FarPeers:
             self._told = {agent: since_us for agent, since_us in self._told.items() if agent in reach.far}
 
     def _is_leased(self, agent: int, heard_us: int, utc_us: int) -> bool:
-        return agent not in self.near and self._told[agent] <= heard_us <= utc_us <= heard_us + LEASE_US
+        return agent not in self.near and self._told[agent] <= heard_us <= utc_us <= heard_us + FAR_LEASE_US
 
     def _is_over(self, agent: int, message: TrajectoryMessage, utc_us: int) -> bool:
         """Return whether a peer can't do without this agent any more, by the lease of its newest message known."""
         place = self._place(agent, message)
-        return utc_us > place.sent_utc_us + LEASE_US + message.committed.clock_error_us
+        return utc_us > place.sent_utc_us + FAR_LEASE_US + message.committed.clock_error_us
 
     def _is_within(self, extent: _Extent) -> bool:
         fastest_m_s, length_m = extent
@@ -230,7 +233,7 @@ class FarPeers:
     def _radius_m(self, place: _Place, utc_us: int) -> float:
         """Return the radius of the ball around where a peer was, with room for the error of its clock."""
         error_us, reach = place.message.committed.clock_error_us, place.message.reach
-        ahead_us = min(max(0, utc_us - place.sent_utc_us) + error_us, LEASE_US) + error_us
+        ahead_us = min(max(0, utc_us - place.sent_utc_us) + error_us, FAR_LEASE_US) + error_us
         return reach.speed_m_s * 1e-6 * ahead_us + reach.stretch_m + place.message.tube_m
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.commit import reach
-from swarmctl.control.commit.reach import LEASE_US, FarPeers
+from swarmctl.control.commit.reach import FAR_LEASE_US, FarPeers
 from swarmctl.core.trajectory import Trajectory, resting
 from swarmctl.core.trajectory_message import ANYWHERE, Reach, TrajectoryMessage
 from tests import builders
@@ -116,8 +116,8 @@ def test_nobody_is_spared_who_has_not_said_that_it_knows(confirmed_us: int) -> N
 
 
 def test_nobody_is_spared_whose_last_word_is_older_than_the_lease() -> None:
-    assert Scene(30.0).spares(at(0.0), LEASE_US)
-    assert not Scene(30.0).spares(at(0.0), LEASE_US + 1)
+    assert Scene(30.0).spares(at(0.0), FAR_LEASE_US)
+    assert not Scene(30.0).spares(at(0.0), FAR_LEASE_US + 1)
 
 
 def test_only_a_message_that_all_hear_begins_the_lease_and_any_other_ends_it() -> None:
@@ -141,14 +141,14 @@ def test_an_immodest_proposal_spares_nobody_and_messages_state_it(immodest: Traj
 
 
 def test_of_an_excluded_peer_distance_alone_counts_once_it_can_not_do_without_the_agent_any_more() -> None:
-    immodest, later_us = moving(0.0, 2.1, 4.0), LEASE_US + 100_000
+    immodest, later_us = moving(0.0, 2.1, 4.0), FAR_LEASE_US + 100_000
 
     def spares(north_m: float, after_us: int) -> bool:
         scene = Scene(north_m)
         return 1 in scene.far_peers.spared(immodest, scene.messages, {}, NOW_US + after_us, {1})
 
     assert spares(100.0, later_us)
-    assert not spares(100.0, LEASE_US - 100_000), "it may still commit without the agent"
+    assert not spares(100.0, FAR_LEASE_US - 100_000), "it may still commit without the agent"
     assert not spares(12.0, later_us), "within what it may have committed to"
 
 
