@@ -271,7 +271,7 @@ def _hub(config: Config, clock: SimClock) -> LocalHub:
         burst_s=bus.burst_s,
         jitter_us=round(bus.jitter_ms * 1000),
     )
-    return LocalHub(clock.now_us, config.seed, impairments)
+    return LocalHub(clock.now_us, config.seed, impairments, lease_us=1000 * bus.lease_ms)
 
 
 def write_events(path: Path, events: Sequence[dict[str, Any]]) -> None:

@@ -8,6 +8,8 @@ from typing import Protocol
 from swarmctl.bus.refusals import RefusedMessage
 from swarmctl.bus.topics import Topic
 
+DEFAULT_LEASE_MS = 1500  # silence after which who can't be reached vanishes from the bus
+
 Subscriptions = Mapping[Topic, Sequence[str] | None]  # senders to receive per topic; None: all but oneself
 
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import zenoh
 
-from swarmctl.bus.bus import Bus
+from swarmctl.bus.bus import DEFAULT_LEASE_MS, Bus
 from swarmctl.bus.marked_keys import Inbox, MarkedPublisher, drain
 from swarmctl.bus.refusals import MISDELIVERED, RefusedMessage
 from swarmctl.bus.silence import DEAF_S, SilenceWatch
@@ -91,7 +91,7 @@ class ZenohBus(Bus):
         me: str,
         subscriptions: Mapping[Topic, Sequence[str]],
         *,
-        lease_ms: int = 1500,
+        lease_ms: int = DEFAULT_LEASE_MS,
         connect_timeout_ms: int = CONNECT_TIMEOUT_MS,
         seal_bytes: int = 0,
         deaf_s: float = DEAF_S,

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from swarmctl.bus.bus import DEFAULT_LEASE_MS
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.params import Params, Vec3
 from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorParams
@@ -58,7 +59,7 @@ class BusParams(Params):
 
     identities: str = ""  # folder written by swarmctl keys init; needed by swarmctl host and station only
     relay: bool = False  # hosts pass on what others say; else each is heard on its own links alone
-    lease_ms: int = Field(1500, ge=500, le=10000)  # silence after which Zenoh closes a link
+    lease_ms: int = Field(DEFAULT_LEASE_MS, ge=500, le=10000)  # silence after which a link is closed
     delay_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, on top of one tick
     loss_01: float = Field(0.0, ge=0, le=1)  # lockstep only
     burst_01: float = Field(0.0, ge=0, le=0.99)  # lockstep only, fraction of time in which a link loses everything

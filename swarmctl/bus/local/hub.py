@@ -8,14 +8,12 @@ from functools import partial
 from operator import itemgetter
 from typing import NamedTuple
 
-from swarmctl.bus.bus import Bus, Subscriptions
+from swarmctl.bus.bus import DEFAULT_LEASE_MS, Bus, Subscriptions
 from swarmctl.bus.local import inboxes
 from swarmctl.bus.local.inboxes import Message
 from swarmctl.bus.local.links import PERFECT, Impairments, Link
 from swarmctl.bus.local.reachability import Reachability, TokenView
 from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
-
-LEASE_US = 1_500_000  # time after which tokens that can't be reached are dropped, as bus.lease_ms
 
 
 class _Receiver(NamedTuple):
@@ -45,6 +43,7 @@ class LocalHub:
         now_us: the simulated clock.
         seed: seed of all random impairments.
         impairments: of every link.
+        lease_us: time after which the token of a participant that can't be reached vanishes.
     """
 
     def __init__(
@@ -52,11 +51,13 @@ class LocalHub:
         now_us: Callable[[], int],
         seed: int = 0,
         impairments: Impairments = PERFECT,
+        *,
+        lease_us: int = 1000 * DEFAULT_LEASE_MS,
     ) -> None:
         self._now_us = now_us
         self._seed = seed
         self._began_us = now_us()
-        self._impairments = impairments
+        self._impairments, self._lease_us = impairments, lease_us
         self._links: dict[tuple[str, str], Link] = {}
         self._receivers: dict[tuple[str, Topic], list[_Receiver]] = {}  # of those attached now
         self._attached: dict[str, LocalBus] = {}
@@ -77,7 +78,7 @@ class LocalHub:
     def split(self, groups: Iterable[frozenset[str]]) -> None:
         """Separate groups of participants, as of a network in parts; a name in no group still reaches everybody.
 
-        Between groups reliable messages wait and the others are lost; tokens vanish after `LEASE_US`.
+        Between groups reliable messages wait and the others are lost; tokens vanish after the lease.
 
         Raises:
             ValueError: a name is in two groups.
@@ -110,7 +111,7 @@ class LocalHub:
         bus = LocalBus(self, name, dict.fromkeys(TOPICS) if subscriptions is None else subscriptions)
         self._attached[name] = bus
         self._receivers.clear()
-        self._views[name] = TokenView(LEASE_US)
+        self._views[name] = TokenView(self._lease_us)
         self._update_views()
         return bus
 
@@ -124,7 +125,7 @@ class LocalHub:
     def alive(self, observer: str) -> frozenset[str]:
         """Return the participants whose tokens an attached one sees.
 
-        One that it can't reach stays for `LEASE_US`; on a failed bus that is every one, the observer included.
+        One that it can't reach stays for the lease; on a failed bus that is every one, the observer included.
         """
         return self._views[observer].alive(self._now_us())
 

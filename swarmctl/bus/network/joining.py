@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 
-from swarmctl.bus.bus import Bus
+from swarmctl.bus.bus import DEFAULT_LEASE_MS, Bus
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.bus.network.sealed_bus import SealedBus
 from swarmctl.bus.network.seals import Sealer, SealVerifier, overhead_bytes
@@ -22,7 +22,7 @@ def join_bus(
     identity: OwnIdentity | None,
     max_age_us: Mapping[str, int],
     utc_us: Callable[[], int],
-    lease_ms: int = 1500,
+    lease_ms: int = DEFAULT_LEASE_MS,
     connect_timeout_ms: int = CONNECT_TIMEOUT_MS,
     carrier: Callable[[Bus], Bus] = lambda bus: bus,
 ) -> Bus:

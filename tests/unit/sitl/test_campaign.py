@@ -23,8 +23,8 @@ from sitl.studies.campaign.store import Store
 from sitl.studies.campaign.trials import CELL_FIELDS, SCHEMA, Cell, Row, Trial, cells
 from sitl.studies.campaign.worker_pool import on_cluster, on_this_machine
 from swarmctl.bus import topics
-from swarmctl.bus.bus import agent_name
-from swarmctl.bus.local.hub import LEASE_US, LocalHub
+from swarmctl.bus.bus import DEFAULT_LEASE_MS, agent_name
+from swarmctl.bus.local.hub import LocalHub
 from swarmctl.config import load
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.obstacle import Obstacle
@@ -33,6 +33,7 @@ from swarmctl.errors import ConfigError, StartError
 CELL = Cell(scenario="swap", agents=3, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="default")
 SWAP = replace(CELL, agents=6, protections="guaranteed")
 REST = np.zeros((2, 3))
+LEASE_US = 1000 * DEFAULT_LEASE_MS
 
 
 def row_of(trial: Trial, code: str = "this") -> Row:

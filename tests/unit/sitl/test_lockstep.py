@@ -91,3 +91,12 @@ def test_recorded_frames_are_stamped_with_the_own_clock(tmp_path: Path) -> None:
 def test_a_tick_of_no_whole_number_of_steps_is_refused_as_a_configuration() -> None:
     with pytest.raises(ConfigError, match=r"sitl\.physics_hz = 250: in lockstep a multiple of agent\.rate_hz = 40"):
         Lockstep(load(None, ("agent.rate_hz=40",)))
+
+
+def test_the_bus_in_memory_drops_who_is_not_reached_after_the_configured_lease() -> None:
+    flight = Lockstep(load(None, ["swarm.agents=2", "bus.lease_ms=700"]))
+    flight.hub.fail()
+    flight.clock.advance(699_999)
+    assert "agent-1" in flight.hub.alive("agent-0")
+    flight.clock.advance(1)
+    assert "agent-1" not in flight.hub.alive("agent-0")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from swarmctl.bus.bus import agent_name
-from swarmctl.bus.local.hub import LEASE_US, LocalBus, LocalHub
+from swarmctl.bus.bus import DEFAULT_LEASE_MS, agent_name
+from swarmctl.bus.local.hub import LocalBus, LocalHub
 from swarmctl.bus.local.links import Impairments
 from swarmctl.bus.topics import COMMAND, PATH, TICK, TOO_LONG
 from swarmctl.core.clock import SimClock
+
+LEASE_US = 1000 * DEFAULT_LEASE_MS
 
 
 def hub_of(names: list[str], delay_us: int = 0, loss_01: float = 0.0) -> tuple[SimClock, LocalHub, list[LocalBus]]:

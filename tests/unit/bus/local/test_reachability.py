@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from swarmctl.bus.local.hub import LEASE_US, LocalBus, LocalHub
+from swarmctl.bus.bus import DEFAULT_LEASE_MS
+from swarmctl.bus.local.hub import LocalBus, LocalHub
 from swarmctl.bus.topics import COMMAND, PATH, TOPICS, Topic
 from swarmctl.core.clock import SimClock
 
@@ -12,6 +13,7 @@ A, B, C, D, OPERATOR = "agent-0", "agent-1", "agent-2", "agent-3", "operator"
 NAMES = (A, B, C, D, OPERATOR)
 GROUPS = (frozenset({A, B}), frozenset({C, D}))
 EVERYBODY = frozenset(NAMES)
+LEASE_US = 1000 * DEFAULT_LEASE_MS
 
 
 class Network:
