@@ -41,6 +41,7 @@ from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.signing_keys import read_keys
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.json_safe import json_safe
+from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, ticks_file
 
 _TAIL_S = 120.0  # time allowed before and after the mission
 _TRUTH_EVERY_US = 20_000
@@ -61,7 +62,7 @@ class FlightLog:
 
     def __post_init__(self) -> None:
         if self.directory is not None:
-            self._tlog = (self.directory / f"agent-{self.agent}.tlog").open("wb")
+            self._tlog = (self.directory / frames_file(self.agent)).open("wb")
 
     def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
         self.rows.append(row)
@@ -92,9 +93,9 @@ class FlightLog:
             return
         with suppress(OSError):
             self._tlog.close()
-        (self.directory / f"agent-{self.agent}.ticks").write_bytes(self.ticks.tobytes())
-        (self.directory / f"agent-{self.agent}.plans").write_bytes(b"".join(self.plans))
-        write_events(self.directory / f"agent-{self.agent}.events.jsonl", self.events)
+        (self.directory / ticks_file(self.agent)).write_bytes(self.ticks.tobytes())
+        (self.directory / plans_file(self.agent)).write_bytes(b"".join(self.plans))
+        write_events(self.directory / events_file(agent_name(self.agent)), self.events)
 
 
 class Lockstep:

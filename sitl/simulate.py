@@ -26,9 +26,10 @@ from swarmctl.files import replace_bytes, write_each
 from swarmctl.ops.flight.summary import summary_lines, unwritten_line, violation_lines
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.telemetry.recording.file_names import RECORDING, TRUTH, events_file, ticks_file
 from swarmctl.telemetry.recording.run_files import load_run, read_plans
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, write_config
-from swarmctl.telemetry.view.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
+from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording, simulated_recording
 from swarmctl.wall_clock import utc_us
 
 
@@ -97,11 +98,12 @@ def _progress(config: Config) -> Iterator[Callable[[float], None]]:
 def _write_rows(flight: Lockstep, directory: Path) -> tuple[str, ...]:
     """Write the files that live processes write; return what the disk did not take."""
     writers: dict[str, Callable[[], object]] = {
-        "truth.bin": lambda: replace_bytes(directory / "truth.bin", flight.truth.tobytes()),
-        **{f"agent-{log.agent}.ticks": log.close for log in flight.logs},
+        TRUTH: lambda: replace_bytes(directory / TRUTH, flight.truth.tobytes()),
+        **{ticks_file(log.agent): log.close for log in flight.logs},
     }
     if flight.fault_events:
-        writers["sitl.events.jsonl"] = lambda: write_events(directory / "sitl.events.jsonl", flight.fault_events)
+        faults = events_file("sitl")
+        writers[faults] = lambda: write_events(directory / faults, flight.fault_events)
     return write_each(writers)
 
 

@@ -278,7 +278,8 @@ def load_recorded(folder: Path) -> Config:
     Raises:
         ConfigError: it is no run folder, a key is unknown, or a value has not its type or range.
     """
-    from swarmctl.telemetry.recording.run_files import CONFIG, read_text, refuse_no_folder  # no agent needs it
+    from swarmctl.telemetry.recording.file_names import CONFIG  # no agent needs these
+    from swarmctl.telemetry.recording.run_files import read_text, refuse_no_folder
 
     refuse_no_folder(folder)
     path = folder / CONFIG

@@ -58,7 +58,8 @@ from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
 from swarmctl.mavlink.signing.signature import SigningKey
-from swarmctl.telemetry.recording.run_files import TRUTH, load_run, read_rows, write_parquet
+from swarmctl.telemetry.recording.file_names import TRUTH
+from swarmctl.telemetry.recording.run_files import load_run, read_rows, write_parquet
 
 AGENTS = 2
 FLIGHT = (f"swarm.agents={AGENTS}", "separation.mode=guaranteed", "mission.duration_s=4", "sitl.start=air")

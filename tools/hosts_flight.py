@@ -34,7 +34,8 @@ from swarmctl.bus.network.hosts import HostParams, ip_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.config import Config, load
 from swarmctl.core.recorded.records import TRUTH_COLUMNS, TRUTH_DTYPE
-from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, TRUTH, read_parquet, read_rows
+from swarmctl.telemetry.recording.file_names import PACKED_TRUTH, TRUTH
+from swarmctl.telemetry.recording.run_files import read_parquet, read_rows
 
 CONFIG = Path(__file__).parents[1] / "configs" / "three_hosts.toml"
 INTO_MISSION_S = 2.0  # when something is broken

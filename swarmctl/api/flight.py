@@ -26,7 +26,7 @@ from swarmctl.ops.orders.mission_file import set_mission
 from swarmctl.ops.orders.operator import read_statuses
 from swarmctl.ops.orders.order_delivery import Reply, deliver
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
-from swarmctl.telemetry.recording.run_files import CONFIG
+from swarmctl.telemetry.recording.file_names import CONFIG
 from swarmctl.telemetry.recording.run_folder import create_run_folder, write_config
 from swarmctl.wall_clock import utc_us
 

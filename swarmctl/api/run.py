@@ -14,14 +14,14 @@ from swarmctl.core.recorded.records import PLAN_COLUMNS, TRUTH_COLUMNS
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.errors import ConfigError
 from swarmctl.telemetry.evaluation.referee import RunData
+from swarmctl.telemetry.recording.file_names import SUMMARY
+from swarmctl.telemetry.recording.run_files import load_run as read_recording
 from swarmctl.telemetry.recording.run_files import (
-    SUMMARY,
     read_plans,
     read_summary,
     read_text,
     refuse_other_swarm,
 )
-from swarmctl.telemetry.recording.run_files import load_run as read_recording
 from swarmctl.telemetry.recording.tables import named_table
 
 if TYPE_CHECKING:

@@ -29,6 +29,7 @@ from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.text import printable
 from swarmctl.errors import StartError
 from swarmctl.process_lifetime import PARENT_ENV, module_command
+from swarmctl.telemetry.recording.file_names import CONFIG, TRUTH, events_file
 
 ROUTER = "router"
 SITL = "sitl"
@@ -108,7 +109,7 @@ def agent_commands(
     """
     commands = []
     for places in _shares(len(context.agents), config.swarm.agents_per_process):
-        argv = module_command("swarmctl", "agent", "--config", f"{config_path or context.directory / 'config.toml'}")
+        argv = module_command("swarmctl", "agent", "--config", f"{config_path or context.directory / CONFIG}")
         argv += ("--run", context.run, "--bus", context.endpoint, "--run-dir", f"{context.directory}")
         agents = tuple(context.agents[place] for place in places)
         fds = tuple(sockets[place].fileno() for place in places) if sockets else ()
@@ -152,8 +153,8 @@ def sitl_command(
     fds = tuple(sock.fileno() for sock in sockets)
     argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
     argv += ("--control", f"{control_socket(context.endpoint)}")
-    argv += ("--events", f"{context.directory / 'sitl.events.jsonl'}")
-    argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent", _priority_flag(context))
+    argv += ("--events", f"{context.directory / events_file(SITL)}")
+    argv += ("--truth", f"{context.directory / TRUTH}", "--die-with-parent", _priority_flag(context))
     return Command(SITL, argv, fds)
 
 

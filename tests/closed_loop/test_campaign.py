@@ -21,7 +21,7 @@ from sitl.studies.campaign.page import REPORT
 from sitl.studies.campaign.quick import QUICK
 from sitl.studies.campaign.trials import Cell, Row, Trial, trial_of
 from swarmctl.core.types import Phase
-from swarmctl.telemetry.recording.run_files import STUDY_ROWS
+from swarmctl.telemetry.recording.file_names import STUDY_ROWS
 
 ROOT = Path(__file__).parents[2]
 SHOWN = "    swarmctl campaign "

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 
-from swarmctl.telemetry.recording.run_files import SUMMARY
+from swarmctl.telemetry.recording.file_names import SUMMARY
 from tests.benches.launches import AIR, NEAR, TWO
 from tests.faults.launched import Bounded, Start
 from tests.faults.row import Off, require

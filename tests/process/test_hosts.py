@@ -17,7 +17,8 @@ import pytest
 
 from swarmctl.core.recorded.records import TRUTH_COLUMNS
 from swarmctl.ops.cli import main
-from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, read_parquet
+from swarmctl.telemetry.recording.file_names import PACKED_TRUTH
+from swarmctl.telemetry.recording.run_files import read_parquet
 from tests.benches.free_ports import free_ports
 from tests.benches.launches import READY_S, Launched
 from tests.process.test_bus import until

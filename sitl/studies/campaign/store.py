@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from sitl.studies.campaign.trials import SCHEMA, Row, Trial, trial_of
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replaced
-from swarmctl.telemetry.recording.run_files import STUDY_ROWS
+from swarmctl.telemetry.recording.file_names import STUDY_ROWS
 
 _SAVE_EVERY_S = 1.0
 _MAX_BYTES = 2**31

@@ -25,7 +25,7 @@ from swarmctl.config import Config, dump, load
 from swarmctl.core.text import told_apart
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError
 from swarmctl.files import replace_text
-from swarmctl.telemetry.recording.run_files import STUDY_ROWS
+from swarmctl.telemetry.recording.file_names import STUDY_ROWS
 
 BASE = "config.toml"  # in the folder: the configuration to which swept values are applied
 _SHOWN_CHANGES = 5

@@ -31,6 +31,7 @@ from swarmctl.ops.decide.inputs import (
     peer_messages,
 )
 from swarmctl.telemetry.evaluation.referee import RunData
+from swarmctl.telemetry.recording.file_names import frames_file
 
 DIFFERS_RAD, DIFFERS_01 = 0.01, 0.01  # attitude and thrust: far more than rounding
 _MOST_TLOG_BYTES = 2**30
@@ -88,7 +89,7 @@ def decide_again(
     """
     if config.separation.mode == "guaranteed":
         raise ConfigError("--decide", ["separation.mode = 'guaranteed': what agents committed to is not recorded"])
-    path = directory / f"{agent_name(agent)}.tlog"
+    path = directory / frames_file(agent)
     try:
         frames = list(frames_of(read_file(path, _MOST_TLOG_BYTES)))
     except OSError as error:

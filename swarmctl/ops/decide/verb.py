@@ -9,7 +9,8 @@ from pathlib import Path
 from swarmctl.config import load, load_recorded
 from swarmctl.errors import ConfigError
 from swarmctl.ops.decide.again import Decisions, compare, decide_again
-from swarmctl.telemetry.recording.run_files import CONFIG, load_run, read_plans
+from swarmctl.telemetry.recording.file_names import CONFIG
+from swarmctl.telemetry.recording.run_files import load_run, read_plans
 
 _SHOWN = 10  # differences of an agent, in text
 

@@ -55,6 +55,7 @@ from swarmctl.process_priority import is_realtime_permitted
 from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.changed_parameters import read_originals
 from swarmctl.telemetry.recording.event_log import EventLog
+from swarmctl.telemetry.recording.file_names import CONFIG, events_file
 from swarmctl.wall_clock import WallClock, utc_us
 
 _BUS_S = 20.0  # timeout for the router to answer
@@ -191,7 +192,7 @@ class Launcher(Services):
         )
         self._links = part.links
         self.clock = WallClock()
-        self.log = EventLog(directory / "launch.events.jsonl", "launch", self.clock.utc_us)
+        self.log = EventLog(directory / events_file("launch"), "launch", self.clock.utc_us)
         self.children: dict[str, Child] = {}
         self._shared: list[Child] = []  # processes of several agents
         self._announced: RunningLaunch | None = None
@@ -268,7 +269,7 @@ class Launcher(Services):
         place = self.context.agents.index(agent)
         own = slice(place, place + 1)
         ends = self._reserved.sockets[own], self._reserved.vehicle_sockets[own]
-        config_path = self.context.directory / "config.toml"
+        config_path = self.context.directory / CONFIG
         (command,) = agent_commands(self._config, context, *ends, config_path=config_path)
         return Child(replace(command, argv=(*command.argv, "--only-land", *self._originals(agent))), directory)
 

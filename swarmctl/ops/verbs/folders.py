@@ -48,7 +48,8 @@ def replay(
     as_json: Annotated[bool, typer.Option("--json", help="With --decide: print JSON.")] = False,
 ) -> int:
     """Open the recording of a run, or have its agents decide again."""
-    from swarmctl.telemetry.view.recordings import RECORDING, open_viewer
+    from swarmctl.telemetry.recording.file_names import RECORDING
+    from swarmctl.telemetry.view.recordings import open_viewer
 
     if decide and web:
         raise ConfigError("replay", ["--decide prints what it finds; leave --web out"])

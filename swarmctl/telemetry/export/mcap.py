@@ -32,6 +32,7 @@ from swarmctl.telemetry.evaluation.referee import JudgedObstacle, RunData
 from swarmctl.telemetry.evaluation.station_clock import by_station_clock
 from swarmctl.telemetry.evaluation.tracks import goal_ned_m, missions
 from swarmctl.telemetry.palette import LIMIT_RGB, NUMBER_RGB, agent_rgb
+from swarmctl.telemetry.recording.file_names import CONFIG, SUMMARY
 from swarmctl.telemetry.recording.run_files import utc_us_of
 from swarmctl.telemetry.recording.tables import named_table
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
@@ -81,8 +82,8 @@ def write_mcap(path: Path, recorded: RecordedFlight) -> None:
     with replaced(path) as file, foxglove.open_mcap(file, context=context) as writer:
         writer.write_metadata("swarmctl", {"version": __version__})
         for name, kind, text in (
-            ("config.toml", "application/toml", recorded.config_toml),
-            ("summary.json", "application/json", recorded.summary_json),
+            (CONFIG, "application/toml", recorded.config_toml),
+            (SUMMARY, "application/json", recorded.summary_json),
         ):
             now_ns = max(0, _begins_us(recorded.run)) * 1000
             writer.attach(log_time=now_ns, create_time=now_ns, name=name, media_type=kind, data=text.encode())

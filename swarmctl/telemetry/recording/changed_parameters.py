@@ -9,9 +9,9 @@ import msgspec
 from msgspec import Meta
 
 from swarmctl.files import read_file
+from swarmctl.telemetry.recording.file_names import MAX_EVENTS_BYTES, events_file
 
 _EVENT = "parameters_changed"
-_MAX_EVENTS_BYTES = 2**28
 
 _Name = Annotated[str, Meta(pattern="^[A-Za-z0-9_]{1,16}$")]
 _Whole = Annotated[int, Meta(ge=-(2**31), lt=2**31)]
@@ -47,12 +47,12 @@ def read_originals(directory: Path, source: str) -> Originals:
         OSError: the events of the agent can't be read.
         ValueError: the event is damaged.
     """
-    for line in reversed(read_file(directory / f"{source}.events.jsonl", _MAX_EVENTS_BYTES).splitlines()):
+    for line in reversed(read_file(directory / events_file(source), MAX_EVENTS_BYTES).splitlines()):
         if _EVENT.encode() in line:
             try:
                 row = msgspec.json.decode(line, type=_Changed)
             except msgspec.DecodeError as error:
-                raise ValueError(f"{source}.events.jsonl: {error}") from error
+                raise ValueError(f"{events_file(source)}: {error}") from error
             if row.event == _EVENT:
                 return row.were
     return {}

@@ -21,10 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.bus.bus import agent_name
 from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, plan_rows
 from swarmctl.core.types import Plan
 from swarmctl.files import hold
 from swarmctl.telemetry.json_safe import to_json
+from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, ticks_file
 
 _FLUSH_TIMEOUT_S = 0.25
 _QUEUE = 16384  # items; about 20 s of ticks and frames, 4 MB
@@ -40,12 +42,12 @@ class Recorder:
     """
 
     def __init__(self, directory: Path, agent: int) -> None:
-        self._source = f"agent-{agent}"
+        self._source = agent_name(agent)
         self._files = (
-            _RowFile(directory / f"{self._source}.ticks", TICK_DTYPE.itemsize),
-            _RowFile(directory / f"{self._source}.tlog"),
-            _RowFile(directory / f"{self._source}.events.jsonl"),
-            _RowFile(directory / f"{self._source}.plans", PLAN_DTYPE.itemsize),
+            _RowFile(directory / ticks_file(agent), TICK_DTYPE.itemsize),
+            _RowFile(directory / frames_file(agent)),
+            _RowFile(directory / events_file(self._source)),
+            _RowFile(directory / plans_file(agent), PLAN_DTYPE.itemsize),
         )
         self._queue: deque[tuple[int, bytes]] = deque()
         self._refused = 0  # written by the tick's thread

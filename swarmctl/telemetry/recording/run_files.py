@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,21 +27,21 @@ from swarmctl.errors import ConfigError
 from swarmctl.files import read_file, replaced
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.evaluation.tracks import MAX_RUN_US
+from swarmctl.telemetry.recording.file_names import (
+    AGENT_FILE,
+    CONFIG,
+    EVENTS,
+    MAX_EVENTS_BYTES,
+    PACKED_PLANS,
+    PACKED_TRUTH,
+    SUMMARY,
+    TRUTH,
+    plans_file,
+)
 from swarmctl.telemetry.recording.summary_file import decode_summary
 from swarmctl.telemetry.recording.tables import VERSION_KEY, plain_table
 
-EVENTS = "events.jsonl"
-SUMMARY = "summary.json"
-TRUTH = "truth.bin"  # while the simulator flies
-PACKED_PLANS = ".plans.parquet"  # of an agent in a finished run; while it flies, .plans
-PACKED_TRUTH = "truth.parquet"  # of a finished run
-CONFIG = "config.toml"
-RECORDING = "telemetry.rrd"
-STUDY_ROWS = "rows.parquet"  # of a campaign or a sweep, whose folder holds no run
-AGENT_FILE = re.compile(r"^agent-(\d{1,3})\.(ticks|parquet)$")
-
 _MAX_ROWS_BYTES = 2**31  # a day of one agent, about the memory of a laptop
-_MAX_EVENTS_BYTES = 2**28
 _MAX_TEXT_BYTES = 2**24
 _MAX_EVENT_DEPTH = 8  # largest nesting of an event; written events nest twice
 _INT64 = range(-(2**63), 2**63)
@@ -75,7 +74,7 @@ def read_plans(directory: Path, agent: int) -> NDArray[np.void]:
     Raises:
         ConfigError: the file has not the expected content.
     """
-    raw = directory / f"agent-{agent}.plans"
+    raw = directory / plans_file(agent)
     return _read_raw_or_packed(raw, raw.with_suffix(PACKED_PLANS), PLAN_COLUMNS, clocks=("t_us", "at_us"))
 
 
@@ -136,7 +135,7 @@ def read_events(directory: Path) -> list[dict[str, Any]]:
     """Return the events of all sources in a run folder, sorted by UTC, without duplicates and invalid lines."""
     lines: dict[bytes, None] = {}
     for path in sorted(directory.glob(f"*{EVENTS}")):
-        lines.update(dict.fromkeys(_content(path, _MAX_EVENTS_BYTES).splitlines()))
+        lines.update(dict.fromkeys(_content(path, MAX_EVENTS_BYTES).splitlines()))
     rows = (_event(line) for line in lines)
     return sorted((row for row in rows if row is not None), key=utc_us_of)
 

@@ -15,17 +15,21 @@ from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import is_held, replace_text, write_each
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
 from swarmctl.telemetry.json_safe import to_json
-from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
-from swarmctl.telemetry.recording.run_files import (
+from swarmctl.telemetry.recording.file_names import (
     AGENT_FILE,
     CONFIG,
     EVENTS,
     PACKED_PLANS,
+    PACKED_TICKS,
     PACKED_TRUTH,
     RECORDING,
     STUDY_ROWS,
     SUMMARY,
     TRUTH,
+    events_file,
+)
+from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
+from swarmctl.telemetry.recording.run_files import (
     load_run,
     read_rows,
     read_summary,
@@ -186,7 +190,7 @@ def _refuse_recorded(directory: Path) -> None:
     Raises:
         StartError: somebody does.
     """
-    for pattern in ("*.ticks", "*.plans", f"*.{EVENTS}", TRUTH):
+    for pattern in ("*.ticks", "*.plans", events_file("*"), TRUTH):
         for path in sorted(directory.glob(pattern)):
             if is_held(path):
                 raise StartError(f"{path}: is still written: the run is not over. Wait until its agents have ended")
@@ -250,13 +254,13 @@ def _merged(*sources: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def _write_events(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     replace_text(directory / EVENTS, "".join(f"{to_json(row)}\n" for row in rows))
-    for path in directory.glob(f"*.{EVENTS}"):
+    for path in directory.glob(events_file("*")):
         path.unlink()
 
 
 def _pack_ticks(path: Path) -> None:
     """Replace a file of raw rows by Parquet."""
-    write_parquet(path.with_suffix(".parquet"), read_rows(path, TICK_DTYPE))
+    write_parquet(path.with_suffix(PACKED_TICKS), read_rows(path, TICK_DTYPE))
     path.unlink()
 
 

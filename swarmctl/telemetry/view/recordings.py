@@ -18,9 +18,9 @@ from swarmctl.core.types import Array
 from swarmctl.errors import StartError
 from swarmctl.files import replaced_by_program
 from swarmctl.telemetry.evaluation.referee import RunData
+from swarmctl.telemetry.recording.file_names import RECORDING
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
-RECORDING = "telemetry.rrd"
 APPLICATION = "swarmctl"
 _MIN_RECORDING_BYTES = 4096  # a smaller packed recording contains no entity and is rejected
 _PLAN_PERIOD_US = 100_000  # of the predicted paths that are drawn

@@ -24,8 +24,9 @@ from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
 from swarmctl.files import replace_text
 from swarmctl.process_lifetime import StopRequest, die_with_parent
 from swarmctl.process_priority import give_way
+from swarmctl.telemetry.recording.file_names import RECORDING
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
-from swarmctl.telemetry.view.recordings import APPLICATION, RECORDING, has_display, open_viewer
+from swarmctl.telemetry.view.recordings import APPLICATION, has_display, open_viewer
 from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_ports
 from swarmctl.wall_clock import WallClock
 
