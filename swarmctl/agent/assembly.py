@@ -13,8 +13,9 @@ from swarmctl.bus.topics import OPERATOR
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock
+from swarmctl.core.mavlink_values import AUTOPILOT_COMPID
 from swarmctl.core.types import GeoOrigin
-from swarmctl.mavlink.codec import AUTOPILOT_COMPID, Codec
+from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import OWN_COMPID, CommandPort
 from swarmctl.mavlink.signing.channel import SigningChannel
 from swarmctl.mavlink.signing.signed_transport import SignedTransport

@@ -12,6 +12,7 @@ from dataclasses import replace
 from swarmctl.check.finding import Finding
 from swarmctl.check.scan.link_facts import VehicleFacts
 from swarmctl.config import Config
+from swarmctl.core.mavlink_values import RC_RECEIVER
 from swarmctl.core.types import Landed
 from swarmctl.core.verdict import Verdict
 from swarmctl.mavlink.dialects.dialect import Dialect, Rule
@@ -19,7 +20,6 @@ from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.dialects.parameter_check import Opinion, ParameterCheck, ParameterContext, ok
 
 Number = float | int
-RC_RECEIVER = 1 << 16  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _WEIGHT_WANTED, _WEIGHT_TABLE = 60, 50
 
 

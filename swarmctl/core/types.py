@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-GPS_FIX_3D = 3  # GPS_FIX_TYPE: this and more is a position
 MAX_MARGIN_M = 10.0  # limit of the margin in a path, so that one peer cannot ground all others
 Sampled = Callable[[Array], tuple[Array, Array]]  # offsets (K,) [s] from now -> positions, velocities, (K, 3) each
 

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import development as dialect
 
+from swarmctl.core.mavlink_values import AUTOPILOT_COMPID
 from swarmctl.mavlink.framing import frames, message_id
 
-AUTOPILOT_COMPID = 1  # MAV_COMP_ID_AUTOPILOT1
 _VERSION_2, _PLAIN = 0xFD, 0  # first byte of a frame; incompatibility flags of one that is not signed
 _HEADER_BYTES, _HEADER_BYTES_1, _CHECKSUM_BYTES = 10, 6, 2  # the second of MAVLink 1
 _HEADER = struct.Struct("<BBBBBBBHB")

@@ -14,6 +14,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mavlink
 
+from swarmctl.core.mavlink_values import ACTIVE, AUTOPILOT_COMPID, GROUND_STATION, NO_AUTOPILOT
 from swarmctl.core.types import Command, Verb
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects.dialect import Dialect
@@ -26,7 +27,6 @@ _HEARTBEAT_US = 1_000_000
 HEARD = frozenset(  # ids of the messages that answer a command
     (mavlink.MAVLINK_MSG_ID_COMMAND_ACK, mavlink.MAVLINK_MSG_ID_PARAM_VALUE, mavlink.MAVLINK_MSG_ID_PARAM_ERROR)
 )
-_GROUND_STATION, _NO_AUTOPILOT, _ACTIVE = 6, 8, 4  # MAV_TYPE_GCS: what PX4 counts for its data-link failsafe
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class CommandPort:
         """
         if heartbeat and now_us >= self._heartbeat_us:
             self._heartbeat_us = now_us + _HEARTBEAT_US
-            beat = mavlink.MAVLink_heartbeat_message(_GROUND_STATION, _NO_AUTOPILOT, 0, 0, _ACTIVE, 3)
+            beat = mavlink.MAVLink_heartbeat_message(GROUND_STATION, NO_AUTOPILOT, 0, 0, ACTIVE, 3)
             self._send(self._codec.encode(beat))
         if not self._steps:
             self._spoken = self._dialect()
@@ -157,14 +157,14 @@ class CommandPort:
             self._steps.clear()
 
     def _message(self, command: Command, dialect: Dialect) -> Any:
+        whom, name = (self._target, AUTOPILOT_COMPID), command.name.encode()
         if command.verb is Verb.PARAM_GET:
-            return mavlink.MAVLink_param_request_read_message(self._target, 1, command.name.encode(), -1)
+            return mavlink.MAVLink_param_request_read_message(*whom, name, -1)
         asked = dialect.long_command(command)
         if asked is None:
-            value, kind = dialect.to_wire(command)
-            return mavlink.MAVLink_param_set_message(self._target, 1, command.name.encode(), value, kind)
+            return mavlink.MAVLink_param_set_message(*whom, name, *dialect.to_wire(command))
         padded = (*asked.params, *(0.0,) * (7 - len(asked.params)))
-        return mavlink.MAVLink_command_long_message(self._target, 1, asked.command, self._tries - 1, *padded)
+        return mavlink.MAVLink_command_long_message(*whom, asked.command, self._tries - 1, *padded)
 
 
 def _in_words(result: int) -> str:

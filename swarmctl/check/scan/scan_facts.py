@@ -17,7 +17,8 @@ from swarmctl.check.scan.link_facts import (
     Version,
 )
 from swarmctl.check.scan.link_statistics import FrameStatistics, round_trip, vehicle_time
-from swarmctl.check.scan.scanner import ARMED_FLAG, VehicleScan
+from swarmctl.check.scan.scanner import VehicleScan
+from swarmctl.core.mavlink_values import ARMED_FLAG
 from swarmctl.core.types import FlightMode, GeoOrigin, Landed
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.signing.refusals import in_words

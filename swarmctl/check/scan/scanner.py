@@ -16,6 +16,14 @@ from pymavlink.dialects.v20 import development as mavlink
 from swarmctl.check.scan.link_statistics import Answer, FrameStatistics
 from swarmctl.check.scan.listener import NOWHERE, Address, Listener, ReceivedDatagram
 from swarmctl.check.scan.parameter_reader import ParameterReader
+from swarmctl.core.mavlink_values import (
+    ACTIVE,
+    ARMED_FLAG,
+    AUTOPILOT_COMPID,
+    NO_AUTOPILOT,
+    ONBOARD_CONTROLLER,
+    PREARM_CHECK,
+)
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects.dialect import Dialect
 from swarmctl.mavlink.dialects.discovery import DIALECTS
@@ -23,13 +31,9 @@ from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.wall_clock import monotonic_us
 
 SCANNER_COMPID = 192  # MAV_COMP_ID_ONBOARD_COMPUTER2: keeps sequence numbers apart from those of a flying agent
-AUTOPILOT_COMPID = 1
-ARMED_FLAG = 128
-_NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a companion, a ground station
 _HEARTBEAT_US, _TIMESYNC_US, _PING_US, _REQUEST_US = 1_000_000, 50_000, 200_000, 500_000
 _REQUESTS = 4  # repetitions without an answer
 _STALE_US = 1_000_000
-_PREARM = 1 << 28  # MAV_SYS_STATUS_PREARM_CHECK
 _FRESH_US = 2_500_000  # an older heartbeat does not show the armed state
 _POLL_S = 0.005
 _ONCE = (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
@@ -132,7 +136,7 @@ class VehicleScan:
         beat, health = self.message("HEARTBEAT"), self.message("SYS_STATUS")
         if beat is not None and beat.base_mode & ARMED_FLAG:
             return True
-        return health is not None and bool(health.onboard_control_sensors_health & _PREARM)
+        return health is not None and bool(health.onboard_control_sensors_health & PREARM_CHECK)
 
     def may_change(self, now_us: int) -> bool:
         """Whether a recent heartbeat shows that the vehicle is disarmed."""
@@ -152,7 +156,7 @@ class VehicleScan:
         if self._there == NOWHERE:
             return
         if self._due("heartbeat", now_us, _HEARTBEAT_US):
-            self._send(mavlink.MAVLink_heartbeat_message(18, _NO_AUTOPILOT, 0, 0, 4, 3))
+            self._send(mavlink.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE, 3))
         if not self.found_autopilot:
             return
         if self._due("timesync", now_us, _TIMESYNC_US):
@@ -232,7 +236,7 @@ class VehicleScan:
     def _message(self, sysid: int, message: Any, heard: ReceivedDatagram) -> None:
         name = message.get_type()
         if name == "HEARTBEAT":
-            if message.autopilot == _NO_AUTOPILOT:
+            if message.autopilot == NO_AUTOPILOT:
                 return
             self._choose(sysid, message.autopilot, heard)
         self.newest[sysid, name] = Newest(heard.t_us, message)

@@ -7,11 +7,11 @@ import math
 from swarmctl.check.finding import Finding, line_of
 from swarmctl.check.scan.link_facts import VehicleFacts
 from swarmctl.config import Config
-from swarmctl.core.types import GPS_FIX_3D, FlightMode
+from swarmctl.core.mavlink_values import CRITICAL, GPS_FIX_3D, PREARM_CHECK
+from swarmctl.core.types import FlightMode
 from swarmctl.core.verdict import Verdict
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
-_CRITICAL = 5  # MAV_STATE
 _SENSOR_BITS = {
     0: "gyro",
     1: "accelerometer",
@@ -30,7 +30,6 @@ _SENSOR_BITS = {
     24: "logging",
     25: "battery",
 }  # MAV_SYS_STATUS_SENSOR
-_PREARM = 1 << 28
 _ESTIMATES = {0: "attitude", 1: "horizontal velocity", 2: "vertical velocity", 4: "horizontal position", 5: "height"}
 _ESTIMATOR_FAULTS = {10: "GPS glitch", 11: "bad accelerometer"}  # bits of ESTIMATOR_STATUS.flags
 _BATTERY_LOW_01, _BATTERY_EMPTY_01 = 0.5, 0.25
@@ -42,7 +41,7 @@ def state(facts: VehicleFacts, config: Config) -> Finding:
     words = (facts.mode.name, "armed" if facts.armed else "disarmed", facts.landed.name.lower().replace("_", " "))
     found = ", ".join(words)
     line = line_of(facts.agent, "state", "disarmed, on ground")
-    if facts.system_status >= _CRITICAL:
+    if facts.system_status >= CRITICAL:
         return line(FIX, found, f"the autopilot reports a failsafe or emergency (MAV_STATE {facts.system_status})", 99)
     if facts.armed and facts.mode is FlightMode.EXTERNAL:
         return line(NOTE, found, "another program flies it by setpoints now; it is not changed", 9)
@@ -57,11 +56,11 @@ def sensors(facts: VehicleFacts, config: Config) -> Finding:
     line = line_of(facts.agent, "sensors", "healthy, ready to arm")
     if sensors is None:
         return line(NOTE, "not told", "SYS_STATUS does not come; the agent asks for it")
-    ill = sensors.present & sensors.enabled & ~sensors.healthy & ~_PREARM
+    ill = sensors.present & sensors.enabled & ~sensors.healthy & ~PREARM_CHECK
     if ill:
         names = ", ".join(_SENSOR_BITS.get(bit, f"bit {bit}") for bit in range(32) if ill >> bit & 1)
         return line(FIX, f"unhealthy: {names}", "see the autopilot's own messages; calibrate, repair or disable", 75)
-    if not facts.armed and not sensors.healthy & _PREARM:
+    if not facts.armed and not sensors.healthy & PREARM_CHECK:
         advice = f"arming would be refused in {facts.mode.name} now; see the autopilot's messages, or change the mode"
         return line(FIX, "not ready to arm", advice, 72)
     return line(OK, "healthy" if facts.armed else "healthy, ready to arm")

@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import development as dialect
 
-from swarmctl.mavlink.codec import AUTOPILOT_COMPID, Codec, heartbeat_of
+from swarmctl.core.mavlink_values import ACTIVE, AUTOPILOT_COMPID, NO_AUTOPILOT, ONBOARD_CONTROLLER
+from swarmctl.mavlink.codec import Codec, heartbeat_of
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.signing.channel import SigningChannel
 from swarmctl.mavlink.signing.refusals import OLD, REPLAYED
 from swarmctl.mavlink.signing.signature import strip
 
-_ONBOARD, _NO_AUTOPILOT, _ACTIVE = 18, 8, 4  # MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID, MAV_STATE
 _GREETING_PERIOD_US = 200_000
 
 
@@ -56,7 +56,7 @@ class SignedRecognition:
         if not any(self._channel.fault(frame) in (OLD, REPLAYED) for frame in self._claimed(datagram)):
             return b""
         self._greeted_us = now_us
-        beat = dialect.MAVLink_heartbeat_message(_ONBOARD, _NO_AUTOPILOT, 0, 0, _ACTIVE, 3)
+        beat = dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE, 3)
         return self._channel.sign(self._codec.encode(beat))
 
     def _claimed(self, datagram: bytes) -> list[bytes]:

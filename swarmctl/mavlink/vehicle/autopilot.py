@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import development as mavlink
 
+from swarmctl.core.mavlink_values import ARMED_FLAG, AUTOPILOT_COMPID, PREARM_CHECK
 from swarmctl.core.text import printable
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
 from swarmctl.mavlink.codec import Codec, message_of
@@ -31,8 +32,6 @@ from swarmctl.mavlink.vehicle.state_samples import StateSamples
 from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 from swarmctl.mavlink.vehicle.vehicle_health import VehicleHealth
 
-_ARMED_FLAG = 128
-_PREARM = 1 << 28
 _KNOWS_POSITION = 8 | 16  # ESTIMATOR_POS_HORIZ_REL, ESTIMATOR_POS_HORIZ_ABS
 _DRIFT_M_S2 = 0.05  # 1-sigma error without GPS over time squared; measured: 0.6 m after 8 s to 2.7 m after 4 s
 _LOST_REPORTS = 2  # one after the other, a second apart: flags drop out for a moment, too
@@ -225,7 +224,7 @@ class Autopilot:
         if dialect is None:
             return
         self.dialect, mode = dialect, dialect.mode(message.custom_mode)
-        self.armed, self.armed_told_us = bool(message.base_mode & _ARMED_FLAG), arrived_us
+        self.armed, self.armed_told_us = bool(message.base_mode & ARMED_FLAG), arrived_us
         self.watch.told(mode, arrived_us, by_heartbeat=True)
         self.watch.status(message.system_status)
 
@@ -236,11 +235,12 @@ class Autopilot:
 
     def _ask_for(self, message_id: int) -> None:
         asked = (float(message_id), *(0.0,) * 6)
-        request = mavlink.MAVLink_command_long_message(self._sysid, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *asked)
+        whom_and_what = self._sysid, AUTOPILOT_COMPID, mavlink.MAV_CMD_REQUEST_MESSAGE
+        request = mavlink.MAVLink_command_long_message(*whom_and_what, 0, *asked)
         self.send_frame(self._codec.encode(request))
 
     def _sys_status(self, message: Any, arrived_us: int) -> None:
-        self.armable = bool(message.onboard_control_sensors_health & _PREARM)
+        self.armable = bool(message.onboard_control_sensors_health & PREARM_CHECK)
         self.health.sys_status(message)
 
     def _extended(self, message: Any, arrived_us: int) -> None:

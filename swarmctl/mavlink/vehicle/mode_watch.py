@@ -8,13 +8,13 @@ that came and went between two polls is shown once, although it is not the newes
 
 from __future__ import annotations
 
+from swarmctl.core.mavlink_values import CRITICAL
 from swarmctl.core.types import FlightMode
 
 _GAP_US = 300_000  # length of a silence, of the agent or the link, that puts the mode in doubt
 _TOLD_LATELY_US = 100_000  # a mode report this young at the end of our own pause was not delayed in a full buffer
 _REQUEST_PERIOD_US = 60_000
 _JUST_US = 200_000
-_CRITICAL = 5  # MAV_STATE
 
 
 class ModeWatch:
@@ -82,8 +82,8 @@ class ModeWatch:
         An autopilot that follows setpoints while its status is critical only warns. An operator's resume is told by
         CURRENT_MODE, up to a second before the next HEARTBEAT.
         """
-        only_warns = self._status == _CRITICAL and self.mode is FlightMode.EXTERNAL
-        return self._status >= _CRITICAL and not only_warns
+        only_warns = self._status == CRITICAL and self.mode is FlightMode.EXTERNAL
+        return self._status >= CRITICAL and not only_warns
 
     def asks(self, now_us: int) -> bool:
         """Whether to request a HEARTBEAT now."""

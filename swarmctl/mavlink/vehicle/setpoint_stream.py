@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import development as mavlink
 
+from swarmctl.core.mavlink_values import AUTOPILOT_COMPID
 from swarmctl.core.types import AttitudeSetpoint
 from swarmctl.mavlink.codec import Codec
 
@@ -49,7 +50,7 @@ class SetpointStream:
             self.refused += 1
             return refused
         stamp_ms, q_nb = now_us // 1000 & 0xFFFFFFFF, setpoint.q_nb.tolist()
-        whom_and_what = self._sysid, 1, _ATTITUDE_ONLY
+        whom_and_what = self._sysid, AUTOPILOT_COMPID, _ATTITUDE_ONLY
         payload = _SETPOINT.pack(stamp_ms, *q_nb, 0.0, 0.0, 0.0, setpoint.thrust_01, *whom_and_what)
         self._measure_gap(now_us, loss_s, departures)
         self._send_frame(self._codec.frame(mavlink.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET, payload))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from swarmctl.core.types import GPS_FIX_3D
+from swarmctl.core.mavlink_values import GPS_FIX_3D
 
 _UNKNOWN_SATELLITES = 255
 

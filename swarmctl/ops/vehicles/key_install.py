@@ -18,8 +18,9 @@ from typing import Any
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.check.scan.listener import NOWHERE, Address, Listener, open_listener
-from swarmctl.check.scan.scanner import ARMED_FLAG, AUTOPILOT_COMPID, SCANNER_COMPID
+from swarmctl.check.scan.scanner import SCANNER_COMPID
 from swarmctl.config import Config
+from swarmctl.core.mavlink_values import ACTIVE, ARMED_FLAG, AUTOPILOT_COMPID, NO_AUTOPILOT, ONBOARD_CONTROLLER
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START, ConfigError
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
@@ -34,7 +35,6 @@ from swarmctl.wall_clock import WallClock, monotonic_us
 _LONGEST_S = 10.0  # heartbeats come once a second, and a request may be lost
 _REQUEST_US = 1_000_000
 _POLL_S = 0.01
-_ONBOARD, _NO_AUTOPILOT, _ACTIVE = 18, 8, 4  # MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID, MAV_STATE
 
 
 class Installation:
@@ -114,12 +114,12 @@ class Installation:
             self._newest = max(self._newest, origin(frame)[1])
             self.done = self._signer is self._key and self._channel.take(frame) is not None
         message = self._codec.decode(strip(frame) if signed else frame)
-        if message is not None and message.get_type() == "HEARTBEAT" and message.autopilot != _NO_AUTOPILOT:
+        if message is not None and message.get_type() == "HEARTBEAT" and message.autopilot != NO_AUTOPILOT:
             self._armed = bool(message.base_mode & ARMED_FLAG)
 
     def _ask(self) -> None:
         """Send a heartbeat, and the key if the vehicle is disarmed and has not got it."""
-        beat = mavlink.MAVLink_heartbeat_message(_ONBOARD, _NO_AUTOPILOT, 0, 0, _ACTIVE, 3)
+        beat = mavlink.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE, 3)
         self._send(beat)
         if self._armed is not False or self._signer is self._key:
             return

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from swarmctl.check.change import Change
 from swarmctl.check.finding import SWARM, Finding, worst_first
-from swarmctl.check.parameters import RC_RECEIVER, changes, names_to_read, unchangeable
+from swarmctl.check.parameters import changes, names_to_read, unchangeable
 from swarmctl.check.scan.link_facts import (
     ArmingProblem,
     Estimator,
@@ -36,6 +36,7 @@ from swarmctl.check.table import _drawn, as_json, print_check
 from swarmctl.config import Config, load
 from swarmctl.control.failsafe.decision import FailsafeParams
 from swarmctl.core.flight_volume import VolumeParams
+from swarmctl.core.mavlink_values import RC_RECEIVER
 from swarmctl.core.types import FlightMode, Landed
 from swarmctl.core.verdict import Verdict
 from swarmctl.mavlink.dialects.arducopter import ARDUCOPTER
