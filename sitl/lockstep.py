@@ -31,6 +31,7 @@ from swarmctl.bus.relay import RelayingBus
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
+from swarmctl.core.json_safe import json_safe
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows
 from swarmctl.core.types import Plan
@@ -40,7 +41,6 @@ from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.signing_keys import read_keys
 from swarmctl.telemetry.evaluation.referee import RunData
-from swarmctl.telemetry.json_safe import json_safe
 from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, ticks_file
 
 _TAIL_S = 120.0  # time allowed before and after the mission

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import enum
 import json
-import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from functools import partial
 
 from rich.console import Console
 from rich.table import Table
@@ -17,6 +15,7 @@ from swarmctl.bus.bus import agent_name
 from swarmctl.check.change import Change
 from swarmctl.check.finding import SWARM, Finding, worst_first
 from swarmctl.check.scan.link_facts import VehicleFacts
+from swarmctl.core.json_safe import json_safe
 from swarmctl.core.text import printable
 from swarmctl.core.verdict import Verdict
 
@@ -40,11 +39,12 @@ def print_check(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], chan
 
 def as_json(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change], code: int) -> str:
     """Return everything as JSON, findings in the order of the table."""
+    as_named = partial(json_safe, enums_by_name=True)
     tree = {
         "exit_code": code,
-        "vehicles": [_json_safe(dataclasses.asdict(v)) for v in vehicles],
-        "findings": [_json_safe(dataclasses.asdict(line)) for line in lines],
-        "changes": [_json_safe({**dataclasses.asdict(c), "done": c.done}) for c in changes],
+        "vehicles": [as_named(dataclasses.asdict(v)) for v in vehicles],
+        "findings": [as_named(dataclasses.asdict(line)) for line in lines],
+        "changes": [as_named({**dataclasses.asdict(c), "done": c.done}) for c in changes],
     }
     return json.dumps(tree, indent=1, allow_nan=False) + "\n"
 
@@ -96,16 +96,3 @@ def _after_table(
     rest = f"{to_fix} to fix" if to_fix else "nothing to fix"
     texts.append(f"{reached} of {len(vehicles)} vehicles reached, {rest}, {len(found) - to_fix} to know")
     return texts
-
-
-def _json_safe(value: Any) -> Any:
-    """Return the value for JSON: enums by name, infinities as null."""
-    if isinstance(value, enum.Enum):
-        return value.name
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Mapping):
-        return {str(key): _json_safe(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_json_safe(item) for item in value]
-    return value

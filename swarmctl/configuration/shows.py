@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import posixpath
 import zipfile
 import zlib
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 from urllib.parse import unquote
 
+from swarmctl.core.json_safe import finite
 from swarmctl.core.text import printable
 from swarmctl.files import read_file
 
@@ -91,7 +91,7 @@ class _Show:
             self.problems.append(f"{who}: settings.trajectory: missing")
             return nothing
         self._check_version(f"{who}: trajectory", trajectory)
-        takeoff_s, listed = _number(trajectory.get("takeoffTime") or 0.0), trajectory.get("points")
+        takeoff_s, listed = finite(trajectory.get("takeoffTime") or 0.0), trajectory.get("points")
         if takeoff_s is None or takeoff_s < 0.0:
             self.problems.append(f"{who}: takeoffTime = {_shown(trajectory['takeoffTime'])}: a time from 0 s on")
         if not isinstance(listed, list) or not listed:
@@ -148,20 +148,9 @@ def _row(point: Any) -> list[float] | None:
     controls = rest[0] if rest and rest[0] is not None else []
     if not isinstance(controls, list) or not all(isinstance(v, list) and len(v) == 3 for v in [place, *controls]):
         return None
-    numbers = [_number(value) for value in [time, *place, *(value for control in controls for value in control)]]
+    numbers = [finite(value) for value in [time, *place, *(value for control in controls for value in control)]]
     found = [number for number in numbers if number is not None]
     return found if len(found) == len(numbers) else None
-
-
-def _number(value: Any) -> float | None:
-    """Return the finite number that a value of JSON is, or None."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if math.isfinite(number) else None
 
 
 def _refused(constant: str) -> NoReturn:

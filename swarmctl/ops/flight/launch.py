@@ -27,6 +27,7 @@ from swarmctl.bus.topics import ENDED, EVENT, OBSTACLES, OPERATOR, STATUS, TICK,
 from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, socket_file
 from swarmctl.config import Config, dump
 from swarmctl.configuration.config_warnings import launch_warning_lines
+from swarmctl.core.json_safe import to_json
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.flight.summary import sum_up
 from swarmctl.ops.orders.operator import list_keepers
@@ -52,7 +53,6 @@ from swarmctl.ops.supervision.status_table import open_display, tell
 from swarmctl.ops.supervision.supervisor import FlightSupervisor, Services
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.process_priority import is_realtime_permitted
-from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.changed_parameters import read_originals
 from swarmctl.telemetry.recording.event_log import EventLog
 from swarmctl.telemetry.recording.file_names import CONFIG, events_file

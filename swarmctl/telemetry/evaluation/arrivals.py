@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.goal import REACHED_M
+from swarmctl.core.json_safe import finite
 from swarmctl.core.types import Array
 from swarmctl.telemetry.evaluation.tracks import newest_mission, true_positions
-from swarmctl.telemetry.json_safe import finite
 
 
 def reached_goals(

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from swarmctl.telemetry.json_safe import finite
+from swarmctl.core.json_safe import finite
 
 _ALLOWED = {  # refusals by one agent for each peer and topic; other reasons are normal for a network or a restart
     "boot": 0,

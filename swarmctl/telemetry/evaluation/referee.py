@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from swarmctl import __version__
 from swarmctl.core.flight_volume import FlightVolume
+from swarmctl.core.json_safe import finite, json_safe
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
 from swarmctl.telemetry.evaluation.arrivals import reached_goals
@@ -40,7 +41,6 @@ from swarmctl.telemetry.evaluation.tracks import (
     unseen_spans,
     utc_offset_us,
 )
-from swarmctl.telemetry.json_safe import finite, json_safe
 
 SUMMED_ERROR = "distances of all agents to their reference, added up; mean over the mission"  # what `index_m` is
 _MAX_LISTED = 10  # largest number of violations of one kind listed in full

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from swarmctl.bus.silence import REOPENED
 from swarmctl.bus.topics import FAR_PATH, PATH
+from swarmctl.core.json_safe import finite
 from swarmctl.core.types import Array, Mode, PlanStatus
 from swarmctl.telemetry.evaluation.reception import unresponsive
 from swarmctl.telemetry.evaluation.tracks import flight_rows
-from swarmctl.telemetry.json_safe import finite
 
 _CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
 _PATHS, _COUNTED = (PATH.name, FAR_PATH.name), ("messages", "bytes")

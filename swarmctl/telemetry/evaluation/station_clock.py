@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.telemetry.json_safe import finite
+from swarmctl.core.json_safe import finite
 
 SENDER_CLOCK = "sender_clock"  # event: the monotonic clock of `agent` is `behind_us` behind the station's, at most
 _WORTH_TELLING_S = 0.05  # smaller differences are corrected without a word

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.bus.bus import agent_name
+from swarmctl.core.json_safe import to_json
 from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, plan_rows
 from swarmctl.core.types import Plan
 from swarmctl.files import hold
-from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, ticks_file
 
 _FLUSH_TIMEOUT_S = 0.25

@@ -10,11 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from swarmctl.core.json_safe import to_json
 from swarmctl.core.recorded.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import is_held, replace_text, write_each
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
-from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.file_names import (
     AGENT_FILE,
     CONFIG,

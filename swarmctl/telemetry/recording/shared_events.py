@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.refusals import IDENTITY, MALFORMED
 from swarmctl.bus.topics import EVENT
+from swarmctl.core.json_safe import to_json
 from swarmctl.core.types import Plan
 from swarmctl.telemetry.evaluation.station_clock import SENDER_CLOCK
-from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.recorder import Recorder, event_line
 
 LEFT_OUT = "left_out"  # field: names of those that an event was too long for

@@ -11,6 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.core.clock import SimClock
+from swarmctl.core.json_safe import to_json
 from swarmctl.core.types import Command, FlightMode, GeoOrigin, Landed, Verb
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CommandPort, CommandResult
@@ -18,7 +19,6 @@ from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.mavlink.vehicle.autopilot import Autopilot
 from swarmctl.mavlink.vehicle_setup import VehicleSetup
-from swarmctl.telemetry.json_safe import to_json
 
 HOME = GeoOrigin(47.397742, 8.545594, 489.4)
 PX4, ARDUCOPTER = 12, 3

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from swarmctl.config import load
+from swarmctl.core.json_safe import to_json
 from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.core.types import Array
 from swarmctl.ops.flight.summary import summary_lines
 from swarmctl.telemetry.evaluation.arrivals import reached_goals
 from swarmctl.telemetry.evaluation.referee import Rules, evaluate
-from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.summary_file import decode_summary
 from swarmctl.telemetry.report.run_report import arrival_texts, summary_rows
 from tests.unit.telemetry.test_referee import run, ticks, truth

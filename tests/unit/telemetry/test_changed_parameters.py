@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from swarmctl.telemetry.json_safe import to_json
+from swarmctl.core.json_safe import to_json
 from swarmctl.telemetry.recording.changed_parameters import decode_originals, read_originals
 from swarmctl.telemetry.recording.recorder import Recorder
 

@@ -13,12 +13,12 @@ import pytest
 from numpy.typing import NDArray
 
 from swarmctl.core.flight_volume import FlightVolume, VolumeParams
+from swarmctl.core.json_safe import to_json
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunData, evaluate
 from swarmctl.telemetry.evaluation.tracks import merge_tracks, track_error, unseen_spans
-from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.summary_file import decode_summary
 from swarmctl.telemetry.report import run_report
 from swarmctl.telemetry.report.run_report import summary_rows
