@@ -19,6 +19,7 @@ from swarmctl.configuration.problems import problems_of
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.discovery.own import OwnError
 from swarmctl.core.params import Params
@@ -54,9 +55,11 @@ def own_problems(
     if controller.is_own:
 
         def make() -> object:
-            return make_controller(
-                controller, vehicle, separation, 0, max_keep_outs=1, stopwatch_ns=time.perf_counter_ns
+            stopwatch_ns = time.perf_counter_ns
+            setup = ControllerSetup(
+                vehicle=vehicle, separation=separation, agent=0, max_keep_outs=1, stopwatch_ns=stopwatch_ns
             )
+            return make_controller(controller, setup)
 
         yield from _problems("controller", controller.kind, make, controller.own_params)
 

@@ -5,14 +5,17 @@ A new field of a noun has its ordinary value here, so that no other test changes
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from swarmctl.bus.messages.json_messages import StatusMessage
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.situation import DesiredReference, Situation
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Start
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
 from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase, PredictedPath, VehicleState
@@ -21,6 +24,26 @@ LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 STILL = np.zeros(3)
 HOVERING = np.array([0.0, 0.0, 9.81])  # u_x, u_y, thrust over mass
 NOBODY: Mapping[int, int] = {}
+
+
+def controller_setup(
+    *,
+    vehicle: VehicleModelParams | None = None,
+    separation: SeparationParams | None = None,
+    agent: int = 0,
+    max_keep_outs: int = 2,
+    stopwatch_ns: Callable[[], int] = lambda: 0,
+    volume: FlightVolume | None = None,
+) -> ControllerSetup:
+    """Return what a controller of the first agent is told: the defaults, and a stopwatch that stands still."""
+    return ControllerSetup(
+        vehicle=vehicle or VehicleModelParams(),
+        separation=separation or SeparationParams(),
+        agent=agent,
+        max_keep_outs=max_keep_outs,
+        stopwatch_ns=stopwatch_ns,
+        volume=volume,
+    )
 
 
 def vehicle_state(

@@ -22,6 +22,7 @@ from swarmctl.control.controllers.discovery import ControllerParams, make_contro
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.estimation.state_filter import StateFilter
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.phases.mission_state import MissionSetup, MissionState
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.mission import MissionReference
@@ -134,10 +135,11 @@ def make_vehicle_setup(setup: AgentSetup, ports: Ports) -> VehicleSetup:
 def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Controller, Controller]:
     """Return the controller for the mission and the one for the transits to the start and to the landing place."""
     params = SEPARATION_MODES[setup.separation.mode].controller(setup)
-    mission = _make_controller(setup, params, stopwatch_ns)
+    told = _controller_setup(setup, stopwatch_ns)
+    mission = make_controller(params, told)
     if params.follows_reference:
         return mission, mission
-    return mission, _make_controller(setup, params.model_copy(update={"kind": "dmpc"}), stopwatch_ns)
+    return mission, make_controller(params.model_copy(update={"kind": "dmpc"}), told)
 
 
 def make_rehearsal(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> Rehearsal:
@@ -147,19 +149,18 @@ def make_rehearsal(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> 
     if params.is_own:
         params = params.model_copy(update={"kind": "dmpc"})
     return Rehearsal(
-        _make_controller(setup, params, ports.stopwatch_ns),
+        make_controller(params, _controller_setup(setup, ports.stopwatch_ns)),
         mode.proposals(setup, ports.stopwatch_ns),
         round(1e6 * setup.params.commit.period_s),
         world_model,
     )
 
 
-def _make_controller(setup: AgentSetup, params: ControllerParams, stopwatch_ns: Stopwatch) -> Controller:
-    return make_controller(
-        params,
-        setup.vehicle_model,
-        setup.separation,
-        setup.agent,
+def _controller_setup(setup: AgentSetup, stopwatch_ns: Stopwatch) -> ControllerSetup:
+    return ControllerSetup(
+        vehicle=setup.vehicle_model,
+        separation=setup.separation,
+        agent=setup.agent,
         max_keep_outs=setup.max_keep_outs,
         stopwatch_ns=stopwatch_ns,
         volume=setup.volume,

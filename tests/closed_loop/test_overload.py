@@ -69,7 +69,7 @@ def test_agents_whose_plans_take_ten_ticks_stay_on_the_ground(
     plan, newest_us, clock = SwarmMpc.plan, dict[int, int](), list[int]()
 
     def slow(mpc: SwarmMpc, problem: Problem) -> Plan:
-        newest_us[mpc._priority_id] = clock[-1]
+        newest_us[mpc._setup.agent] = clock[-1]
         return plan(mpc, problem)
 
     def until(lockstep: Lockstep) -> bool:

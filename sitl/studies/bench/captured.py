@@ -26,10 +26,9 @@ from numpy.typing import NDArray
 from sitl.lockstep import Lockstep
 from sitl.studies.bench.slsqp import KEPT_M, NonlinearAnswer, NonlinearXy
 from swarmctl.config import Config, load
-from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.kind import Controller
-from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.solvers.qp import QpParams, installed_solvers
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
@@ -123,14 +122,8 @@ def settled_garbage() -> Iterator[None]:
 class TappedMpc(SwarmMpc):
     """The controller of a flight that records its last x-y problem and the duration of its solution."""
 
-    def __init__(
-        self,
-        params: MpcParams,
-        vehicle: VehicleModelParams,
-        separation: SeparationParams,
-        max_keep_outs: int = _MAX_KEEP_OUTS,
-    ) -> None:
-        super().__init__(params, vehicle, separation, 0, max_keep_outs=max_keep_outs, stopwatch_ns=time.thread_time_ns)
+    def __init__(self, params: MpcParams, setup: ControllerSetup) -> None:
+        super().__init__(params, setup)
         self._genuine = self._xy.solve
         self._xy.solve = self._watched  # type: ignore[method-assign]
         self.solve_ms = 0.0
@@ -242,7 +235,14 @@ def tapped(config: Config, solver: str) -> TappedMpc:
     """Return the controller of `config` with another QP solver."""
     params = config.controller.mpc
     qp = QpParams.model_validate({**params.qp.model_dump(), "solver": solver})
-    return TappedMpc(params.model_copy(update={"qp": qp}), config.vehicle_model, config.separation)
+    setup = ControllerSetup(
+        vehicle=config.vehicle_model,
+        separation=config.separation,
+        agent=0,
+        max_keep_outs=_MAX_KEEP_OUTS,
+        stopwatch_ns=time.thread_time_ns,
+    )
+    return TappedMpc(params.model_copy(update={"qp": qp}), setup)
 
 
 class _Running:

@@ -22,6 +22,7 @@ from swarmctl.control.controllers.discovery import make_controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.fallback import brake_and_hold_plan
 from swarmctl.control.model import Predictor
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.reference.mission import MissionReference
@@ -50,11 +51,13 @@ class Pilot:
         max_keep_outs = min(config.swarm.agents - 1, config.separation.max_neighbours) + len(config.obstacles)
         self._controller = make_controller(
             config.controller,
-            config.vehicle_model,
-            config.separation,
-            agent,
-            max_keep_outs=max_keep_outs,
-            stopwatch_ns=time.perf_counter_ns,
+            ControllerSetup(
+                vehicle=config.vehicle_model,
+                separation=config.separation,
+                agent=agent,
+                max_keep_outs=max_keep_outs,
+                stopwatch_ns=time.perf_counter_ns,
+            ),
         )
         self._dt_us, self._steps = self._controller.dt_us, self._controller.steps
         self._predictor = Predictor(config.vehicle_model)

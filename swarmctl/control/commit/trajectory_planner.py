@@ -15,6 +15,7 @@ from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOut, KeepOut
 from swarmctl.control.commit.commit_params import CommitParams, planning
 from swarmctl.control.commit.situation import Situation, with_run_up
 from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 from swarmctl.control.reference.approach import approached
@@ -75,12 +76,14 @@ class TrajectoryPlanner:
         self._hardest_m_s2 = bounded.accel_max_m_s2(vehicle)
         self._mpc = SwarmMpc(
             bounded,
-            vehicle.model_copy(update={"attitude_rad_s": 0.0}),
-            right_of_way,
-            agent,
-            max_keep_outs=max_keep_outs,
-            stopwatch_ns=stopwatch_ns,
-            volume=volume,
+            ControllerSetup(
+                vehicle=vehicle.model_copy(update={"attitude_rad_s": 0.0}),
+                separation=right_of_way,
+                agent=agent,
+                max_keep_outs=max_keep_outs,
+                stopwatch_ns=stopwatch_ns,
+                volume=volume,
+            ),
         )
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self._mpc.steps + math.ceil(

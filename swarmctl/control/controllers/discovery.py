@@ -6,21 +6,18 @@ controller of somebody else is named "package.module:Class" or offered by an ins
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
 from swarmctl.control import controllers
-from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.guard import Guard
-from swarmctl.control.controllers.kind import Controller, ControllerKind, ControllerSetup
+from swarmctl.control.controllers.kind import Controller, ControllerKind
 from swarmctl.control.controllers.own import GROUP, OwnController
-from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.discovery.declared import declared
 from swarmctl.core.discovery.own import BuiltInOrOwn, OwnError, in_words, own_class
-from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.params import Params, with_sections
 
 _KINDS: list[ControllerKind[Any]] = list(declared(controllers, ControllerKind))
@@ -66,25 +63,8 @@ class ControllerParams(Params):
         return found
 
 
-def make_controller(
-    params: ControllerParams,
-    vehicle: VehicleModelParams,
-    separation: SeparationParams,
-    agent: int,
-    *,
-    max_keep_outs: int,
-    stopwatch_ns: Callable[[], int],
-    volume: FlightVolume | None = None,
-) -> Controller:
-    """Return the controller that a configuration asks for, with rows for `max_keep_outs` keep-outs at once."""
-    setup = ControllerSetup(
-        vehicle=vehicle,
-        separation=separation,
-        agent=agent,
-        max_keep_outs=max_keep_outs,
-        stopwatch_ns=stopwatch_ns,
-        volume=volume,
-    )
+def make_controller(params: ControllerParams, setup: ControllerSetup) -> Controller:
+    """Return the controller that a configuration asks for."""
     if params.is_own:
         fallback = _built_in(_FALLBACK, params, setup)
         return Guard(params.kind, make_own(params, setup, fallback), fallback, setup)

@@ -16,8 +16,9 @@ import numpy as np
 
 from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
 from swarmctl.control.collision.volume_certificate import volume_margin_m
-from swarmctl.control.controllers.kind import Controller, ControllerSetup
+from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.controllers.own import OwnController
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.rollout import ModelledVehicle
 from swarmctl.core.discovery.own import in_words, raised_at, traced

@@ -6,10 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.params import Params
 from swarmctl.core.types import Plan
 
@@ -36,18 +34,6 @@ class Controller(Protocol):
 
     def reset(self) -> None:
         """Forget the past, after a handover."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ControllerSetup:
-    """Holds what a controller is told beside its own parameters."""
-
-    vehicle: VehicleModelParams
-    separation: SeparationParams
-    agent: int
-    max_keep_outs: int  # at once
-    volume: FlightVolume | None  # to stay in
-    stopwatch_ns: Callable[[], int]  # measures and has no influence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from swarmctl.control.controllers.kind import ControllerKind, ControllerSetup
+from swarmctl.control.controllers.kind import ControllerKind
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 from swarmctl.core.types import Plan
@@ -14,15 +15,7 @@ class SingleMpc(SwarmMpc):
     """Plans as if there were no keep-outs."""
 
     def __init__(self, params: MpcParams, setup: ControllerSetup) -> None:
-        super().__init__(
-            params,
-            setup.vehicle,
-            setup.separation,
-            setup.agent,
-            max_keep_outs=0,
-            stopwatch_ns=setup.stopwatch_ns,
-            volume=setup.volume,
-        )
+        super().__init__(params, replace(setup, max_keep_outs=0))
 
     def plan(self, problem: Problem) -> Plan:
         return super().plan(replace(problem, keep_outs=()))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarmctl.control.controllers.kind import ControllerKind, ControllerSetup
+from swarmctl.control.controllers.kind import ControllerKind
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.types import Plan, PlanStatus

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from swarmctl.control.controllers.kind import ControllerSetup
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.rollout import ModelledVehicle
 from swarmctl.core.params import Params

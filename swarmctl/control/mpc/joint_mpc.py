@@ -8,21 +8,18 @@ the products themselves.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces, Penalties
 from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.judgement import judged
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.sized_mpc import SizedMpc
 from swarmctl.control.mpc.swarm_mpc import MpcParams, faces_along, first_guess, near_half_spaces, planned
-from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_NED_M_S2
 from swarmctl.core.types import Array, Plan
 
@@ -35,24 +32,8 @@ _MIN_THRUST_M_S2 = 1.0  # without thrust, tilt would have no effect in the model
 class JointMpc:
     """Plans x, y and z in one problem with half-spaces, and certifies the result over true distances."""
 
-    def __init__(
-        self,
-        params: MpcParams,
-        vehicle: VehicleModelParams,
-        separation: SeparationParams,
-        own_priority_id: int,
-        *,
-        max_keep_outs: int,
-        stopwatch_ns: Callable[[], int],
-        volume: FlightVolume | None = None,
-    ) -> None:
-        self._params, self._separation, self._priority_id, self._max_keep_outs = (
-            params,
-            separation,
-            own_priority_id,
-            max_keep_outs,
-        )
-        self._stopwatch_ns, self._volume = stopwatch_ns, volume
+    def __init__(self, params: MpcParams, setup: ControllerSetup) -> None:
+        self._params, self._setup, vehicle = params, setup, setup.vehicle
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self.longest = params.horizon_xy
         eps, eps_relative = _TOLERANCE_01 * params.qp.eps, _TOLERANCE_01 * params.qp.eps_relative
@@ -62,29 +43,29 @@ class JointMpc:
                 (*params.horizontal(vehicle), params.vertical()),
                 params.horizon_of_xy(vehicle),
                 room,
-                separation.relax_01,
+                setup.separation.relax_01,
                 penalties=Penalties(),
                 qp=params.qp.model_copy(update={"eps": eps, "eps_relative": eps_relative}),
-                stopwatch_ns=stopwatch_ns,
-                faces=faces_along(volume, slice(0, 3)),
+                stopwatch_ns=setup.stopwatch_ns,
+                faces=faces_along(setup.volume, slice(0, 3)),
             )
 
-        self._mpc = SizedMpc(joint, max_keep_outs)
+        self._mpc = SizedMpc(joint, setup.max_keep_outs)
 
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
-        began_ns = self._stopwatch_ns()
+        began_ns = self._setup.stopwatch_ns()
         guess = first_guess(problem, self._params.dt_s, self.steps)
         near = partial(
             near_half_spaces,
             problem=problem,
             guess_ned_m=guess,
             axes=3,
-            max_keep_outs=self._max_keep_outs,
+            max_keep_outs=self._setup.max_keep_outs,
             dt_s=self._params.dt_s,
-            own_priority_id=self._priority_id,
+            own_priority_id=self._setup.agent,
         )
-        return planned(near, partial(self._plan, problem, began_ns), self._separation, self._stopwatch_ns)
+        return planned(near, partial(self._plan, problem, began_ns), self._setup.separation, self._setup.stopwatch_ns)
 
     def reset(self) -> None:
         """Keep all: only a warm start outlasts a tick."""
@@ -102,7 +83,7 @@ class JointMpc:
         motion = np.empty((2, steps + 1, 3))
         motion[0, 0], motion[1, 0] = start.pos_ned_m, start.vel_ned_m_s
         motion[:, 1:] = ahead.motion(start.pos_ned_m, start.vel_ned_m_s, drift_m_s2 - found.u[:, 2:] * along)
-        first_row, stopwatch_ns = ahead.first_row(), self._stopwatch_ns
+        first_row, stopwatch_ns = ahead.first_row(), self._setup.stopwatch_ns
         return judged(
             problem,
             motion[0],
@@ -114,7 +95,7 @@ class JointMpc:
             began_ns=began_ns,
             spaces_us=spaces_us,
             stopwatch_ns=stopwatch_ns,
-            volume=self._volume,
+            volume=self._setup.volume,
         )
 
     def _solve(

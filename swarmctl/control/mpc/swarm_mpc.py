@@ -22,6 +22,7 @@ from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationP
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Faces, HalfSpaces, Horizon, Penalties, Terminal
 from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.judgement import judged
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.sized_mpc import SizedMpc
@@ -137,24 +138,8 @@ class MpcParams(Params):
 class SwarmMpc:
     """Plans with the z-MPC, then the x-y MPC with half-spaces, and certifies the result over true distances."""
 
-    def __init__(
-        self,
-        params: MpcParams,
-        vehicle: VehicleModelParams,
-        separation: SeparationParams,
-        own_priority_id: int,
-        *,
-        max_keep_outs: int,
-        stopwatch_ns: Callable[[], int],
-        volume: FlightVolume | None = None,
-    ) -> None:
-        self._params, self._separation, self._priority_id, self._max_keep_outs = (
-            params,
-            separation,
-            own_priority_id,
-            max_keep_outs,
-        )
-        self._stopwatch_ns, self._volume = stopwatch_ns, volume
+    def __init__(self, params: MpcParams, setup: ControllerSetup) -> None:
+        self._params, self._setup, vehicle = params, setup, setup.vehicle
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = params.horizon_xy
         self.longest = max(params.horizon_xy, params.horizon_z)  # reference steps needed
@@ -165,8 +150,8 @@ class SwarmMpc:
             1.0,
             penalties=Penalties(),
             qp=params.qp,
-            stopwatch_ns=stopwatch_ns,
-            faces=faces_along(volume, slice(2, 3)),
+            stopwatch_ns=setup.stopwatch_ns,
+            faces=faces_along(setup.volume, slice(2, 3)),
         )
 
         def across(room: int) -> CondensedMpc:
@@ -174,14 +159,14 @@ class SwarmMpc:
                 params.horizontal(vehicle),
                 params.horizon_of_xy(vehicle),
                 room,
-                separation.relax_01,
+                setup.separation.relax_01,
                 penalties=Penalties(),
                 qp=params.qp,
-                stopwatch_ns=stopwatch_ns,
-                faces=faces_along(volume, slice(0, 2)),
+                stopwatch_ns=setup.stopwatch_ns,
+                faces=faces_along(setup.volume, slice(0, 2)),
             )
 
-        self._xy = SizedMpc(across, max_keep_outs)
+        self._xy = SizedMpc(across, setup.max_keep_outs)
         self._xy_alone = across(0)  # without keep-outs the problem is small and solved exactly
         self._newest: Array | None = None  # (2, Hc) increments of the newest plan
         self._before: Array | None = None  # of the one of the tick before
@@ -191,7 +176,7 @@ class SwarmMpc:
 
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
-        began_ns = self._stopwatch_ns()
+        began_ns = self._setup.stopwatch_ns()
         self._before = self._newest
         up = self._solve_z(problem)
         guess = first_guess(problem, self._params.dt_s, self.steps)
@@ -202,15 +187,15 @@ class SwarmMpc:
             problem=problem,
             guess_ned_m=guess,
             axes=2,
-            max_keep_outs=self._max_keep_outs,
+            max_keep_outs=self._setup.max_keep_outs,
             dt_s=self._params.dt_s,
-            own_priority_id=self._priority_id,
+            own_priority_id=self._setup.agent,
         )
 
         def plan(spaces: HalfSpaces | None, spaces_us: float) -> Plan:
             return self._plan(problem, up, began_ns, spaces, spaces_us=spaces_us)
 
-        return planned(near, plan, self._separation, self._stopwatch_ns)
+        return planned(near, plan, self._setup.separation, self._setup.stopwatch_ns)
 
     def reset(self) -> None:
         """Forget the newest plan; solvers keep their warm starts."""
@@ -250,8 +235,8 @@ class SwarmMpc:
             dt_us=self.dt_us,
             began_ns=began_ns,
             spaces_us=spaces_us,
-            stopwatch_ns=self._stopwatch_ns,
-            volume=self._volume,
+            stopwatch_ns=self._setup.stopwatch_ns,
+            volume=self._setup.volume,
         )
 
     def _solve_z(self, problem: Problem) -> AxesSolution:

@@ -10,11 +10,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOut, SeparationParams
+from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.controllers.discovery import CONTROLLERS, ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.controllers.pid import PidParams
-from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
@@ -30,11 +29,7 @@ PLANNING: list[Kind] = ["dmpc", "dmpc3", "mpc"]
 def make(kind: Kind, max_keep_outs: int = 2, **params: Any) -> Controller:
     return make_controller(
         ControllerParams(kind=kind, **params),
-        VehicleModelParams(),
-        SeparationParams(),
-        0,
-        max_keep_outs=max_keep_outs,
-        stopwatch_ns=time.perf_counter_ns,
+        builders.controller_setup(max_keep_outs=max_keep_outs, stopwatch_ns=time.perf_counter_ns),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
-from swarmctl.control.model import VehicleModelParams, acceleration
+from swarmctl.control.model import acceleration
 from swarmctl.control.mpc.axes import Terminal
 from swarmctl.control.mpc.joint_mpc import JointMpc
 from swarmctl.control.mpc.problem import Problem
@@ -52,16 +52,12 @@ def joint(max_keep_outs: int = 4, separation: SeparationParams | None = None, **
     params.setdefault("z", {"q_pos": 2.0, "q_vel": 0.05, "r": 0.01})  # as configs/improved_5_circle_dmpc3.toml
     return JointMpc(
         MpcParams(**params),
-        VehicleModelParams(),
-        separation or SeparationParams(),
-        0,
-        max_keep_outs=max_keep_outs,
-        stopwatch_ns=lambda: 0,
+        builders.controller_setup(separation=separation, max_keep_outs=max_keep_outs),
     )
 
 
 def four_places(kind: type[JointMpc] | type[SwarmMpc], params: MpcParams) -> JointMpc | SwarmMpc:
-    return kind(params, VehicleModelParams(), SeparationParams(), 0, max_keep_outs=4, stopwatch_ns=lambda: 0)
+    return kind(params, builders.controller_setup(max_keep_outs=4))
 
 
 def ball(offset: Point, any_height: bool = False, priority_id: int = -1) -> KeepOut:
@@ -227,7 +223,7 @@ def test_a_wall_is_passed_above_or_below_with_every_plan_certified(lower_m: floa
 
 def test_the_thesis_controller_cannot_pass_that_wall() -> None:
     flight = fly(
-        SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, max_keep_outs=4, stopwatch_ns=lambda: 0),
+        SwarmMpc(MpcParams(), builders.controller_setup(max_keep_outs=4)),
         (4.0, 0.0, 0.0),
         wall(0.2),
         ticks=200,

@@ -10,7 +10,7 @@ import pytest
 
 from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
-from swarmctl.control.model import VehicleModelParams, acceleration
+from swarmctl.control.model import acceleration
 from swarmctl.control.mpc.axes import AxesSolution
 from swarmctl.control.mpc.judgement import RESIDUAL_LIMIT_M
 from swarmctl.control.mpc.problem import Problem, Start
@@ -57,9 +57,7 @@ def plan_to(
     begin: Start | None = None,
     **params: Any,
 ) -> Plan:
-    mpc = SwarmMpc(
-        MpcParams(**params), VehicleModelParams(), SeparationParams(), 0, max_keep_outs=2, stopwatch_ns=lambda: 0
-    )
+    mpc = SwarmMpc(MpcParams(**params), builders.controller_setup())
     return mpc.plan(problem(offset, *keep_outs, wind=wind, begin=begin))
 
 
@@ -216,7 +214,7 @@ def solution(residual_m: float, solved: bool = True) -> AxesSolution:
 def test_every_solver_status_is_checked(
     monkeypatch: pytest.MonkeyPatch, residual_m: float, solved: bool, status: PlanStatus
 ) -> None:
-    mpc = SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, max_keep_outs=2, stopwatch_ns=lambda: 0)
+    mpc = SwarmMpc(MpcParams(), builders.controller_setup())
     monkeypatch.setattr(mpc._xy_alone, "solve", lambda *_, **__: solution(residual_m, solved))
     assert mpc.plan(problem()).status is status
 
@@ -246,19 +244,11 @@ def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_
     neighbour = fixed(HERE + np.array([0.5, 0.0, 0.0]), 0.8)
     alone = make_controller(
         ControllerParams(kind="mpc"),
-        VehicleModelParams(),
-        SeparationParams(),
-        0,
-        max_keep_outs=2,
-        stopwatch_ns=lambda: 0,
+        builders.controller_setup(),
     )
     together = make_controller(
         ControllerParams(kind="dmpc"),
-        VehicleModelParams(),
-        SeparationParams(),
-        0,
-        max_keep_outs=2,
-        stopwatch_ns=lambda: 0,
+        builders.controller_setup(),
     )
     free, kept = (c.plan(problem((0.5, 0.0, 0.0), neighbour)) for c in (alone, together))
     assert free.status is PlanStatus.OK
@@ -268,9 +258,7 @@ def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_
 
 def test_times_are_measured_with_the_stopwatch_and_add_up() -> None:
     now_ns = iter(range(0, 10**9, 1000))  # every reading is 1 us after the last
-    mpc = SwarmMpc(
-        MpcParams(), VehicleModelParams(), SeparationParams(), 0, max_keep_outs=2, stopwatch_ns=lambda: next(now_ns)
-    )
+    mpc = SwarmMpc(MpcParams(), builders.controller_setup(stopwatch_ns=lambda: next(now_ns)))
     neighbour = fixed(HERE + np.array([1.3, 0.0, 0.0]))
     times = mpc.plan(problem((0.1, 0.0, 0.0), neighbour)).times
     # read at the start, round both solves and the half-spaces, after them, and after the certificate: eight intervals
@@ -343,9 +331,7 @@ def test_from_rest_peers_beyond_the_gate_are_avoided(kind: Literal["dmpc", "dmpc
     ahead = on_circle((-0.1, 5.0, -3.4), 100)
     along = Reference(ahead, np.gradient(ahead, 0.05, axis=0), 0.0)
     params = ControllerParams(kind=kind, mpc=MpcParams(dt_s=0.05, control_xy=20, u_max=0.75))
-    mpc = make_controller(
-        params, VehicleModelParams(), SeparationParams(radius_m=1.6), 1, max_keep_outs=2, stopwatch_ns=lambda: 0
-    )
+    mpc = make_controller(params, builders.controller_setup(separation=SeparationParams(radius_m=1.6), agent=1))
     keep_outs = tuple(
         builders.keep_out(pos_ned_m=path, radius_m=1.6, hard_min_distance_m=1.55, priority_id=priority_id)
         for path, priority_id in zip(peers, (0, 2), strict=True)

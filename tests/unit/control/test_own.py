@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from swarmctl.config import dump, load
-from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.controllers.guard import BAD_IN_A_ROW, LATE_IN_A_ROW, Guard
 from swarmctl.control.controllers.kind import Controller
@@ -43,11 +42,7 @@ def guarded(answer: Any, took_s: float = 0.0) -> Controller:
     clock = itertools.count(0, round(took_s * 1e9))
     return make_controller(
         ControllerParams(kind=f"{__name__}:Scripted"),
-        VehicleModelParams(),
-        SeparationParams(),
-        0,
-        max_keep_outs=2,
-        stopwatch_ns=lambda: next(clock),
+        builders.controller_setup(stopwatch_ns=lambda: next(clock)),
     )
 
 

@@ -36,13 +36,7 @@ UTC_US = 1_700_000_000_000_000
 
 def controller(kind: str = "dmpc", volume: FlightVolume | None = VOLUME) -> Controller:
     return make_controller(
-        ControllerParams(kind=kind),
-        MODEL,
-        SeparationParams(),
-        0,
-        max_keep_outs=1,
-        stopwatch_ns=lambda: 0,
-        volume=volume,
+        ControllerParams(kind=kind), builders.controller_setup(vehicle=MODEL, max_keep_outs=1, volume=volume)
     )
 
 
