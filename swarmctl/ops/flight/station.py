@@ -32,6 +32,7 @@ from swarmctl.ops.processes import ROUTER, VIEWER
 from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
+from swarmctl.ops.supervision.own_pause import OwnPause
 from swarmctl.ops.supervision.recovery import RECOVERY_S
 from swarmctl.ops.supervision.sender_clocks import SenderClocks
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
@@ -44,7 +45,6 @@ from swarmctl.wall_clock import WallClock
 _STEP_S = 0.05
 _GONE_S = 3.0  # an agent that was done and is silent for so long has ended
 _SILENT_S = 5.0  # an agent in flight that is silent for so long when the station is ended counts as lost; 25 statuses
-_PAUSE_S = 0.5  # of the station itself
 
 
 def run_station(config: Config, options: LaunchOptions) -> int:
@@ -140,14 +140,14 @@ class SwarmWatch:
         self._without: set[int] = set()  # agents of which another one has said that it goes on without them
         self._ends = VouchedEnds(vouchers)
         self._died: dict[int, str] = {}  # agents whose process ended before the vehicle was down, in words
-        self._stepped_s = clock_s()
+        self._own_pause = OwnPause(clock_s())
         self.problems: list[str] = []
         self.was_stopped = self.is_over = False
 
     def step(self) -> bool:
         """Show and record what has arrived; returns whether it is over."""
         now_s = self._clock_s()
-        self._excuse_own_pause(now_s)
+        self._own_pause.excuse(now_s, self._views)
         self._record_ticks()
         self._record_events()
         for status in self._report.statuses():
@@ -255,13 +255,6 @@ class SwarmWatch:
     def _say(self, event: str, text: str, **fields: Any) -> None:
         self._note(event, text=text, **fields)
         self._display.print_line(text)
-
-    def _excuse_own_pause(self, now_s: float) -> None:
-        """Count no time in which this process itself did not run: nobody was lost in it."""
-        paused_s, self._stepped_s = now_s - self._stepped_s, now_s
-        if paused_s > _PAUSE_S:
-            for view in self._views:
-                view.received_s += paused_s
 
 
 def _is_done(view: AgentView) -> bool:

@@ -27,6 +27,7 @@ from swarmctl.ops.supervision.ended_processes import EndedProcesses
 from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
+from swarmctl.ops.supervision.own_pause import OwnPause
 from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.supervision.standstill import Standstill
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
@@ -44,7 +45,6 @@ _BEYOND_MISSION_S = 300.0  # for take-off, waiting and landing; a longer flight 
 _TIMED = (Phase.TRACK, Phase.GOTO_LAND)  # phases whose end is known
 _SILENCE_S = 5.0
 _STANDSTILL_S = 5.0  # of a silent agent, after which it is ended
-_PAUSE_S = 0.5  # of the supervisor
 _LAND_S = 60.0
 _LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
@@ -103,7 +103,8 @@ class FlightSupervisor:
         )
         self._hearing = Hearing(self._bus, self._announce)
         self._standstill = Standstill()
-        self._started_s = self._stepped_s = time.monotonic()
+        self._started_s = time.monotonic()
+        self._own_pause = OwnPause(self._started_s)
         self._mission_ends_s = self._started_s + config.mission.duration_s  # at the earliest
         self._reported: set[str] = set()
         self._router_starts = 0  # how often it was started again
@@ -124,7 +125,7 @@ class FlightSupervisor:
             text = f"{len(configured)} obstacles, as configured"
             self._services.log.write("obstacles", text=text, **recorded_list(self._obstacles.newest))
         while interrupts() < 2:
-            self._excuse_own_pause()
+            self._own_pause.excuse(time.monotonic(), self._views)
             self._receive()
             self._watch_essential_processes()
             self._viewer_watch.step()
@@ -153,15 +154,6 @@ class FlightSupervisor:
         for words in self._result.left:
             self._fail("vehicle_left", words)
         return self._result
-
-    def _excuse_own_pause(self) -> None:
-        """Count no time in which this process itself did not run: what arrived then is not yet passed on."""
-        now_s = time.monotonic()
-        paused_s = now_s - self._stepped_s
-        self._stepped_s = now_s
-        if paused_s > _PAUSE_S:
-            for view in self._views:
-                view.received_s += paused_s if view.status is not None else 0.0
 
     def _receive(self) -> None:
         for status in self._report.statuses():
