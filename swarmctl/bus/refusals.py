@@ -24,6 +24,7 @@ SUPERSEDED_ORDER = "superseded_order"  # a newer order has been obeyed
 
 # Caused by networks, restarts or Zenoh alone
 HARMLESS = frozenset((REPLAYED, LATE, MISDELIVERED, UNCONFIRMED, SUPERSEDED_ORDER))
+MOST_REFUSED = 4096  # kept by a bus until they are asked for
 _EVENT_PERIOD_US = 1_000_000
 _ALERT_HOLD_US = 5_000_000  # time an alert is shown after the last refusal
 

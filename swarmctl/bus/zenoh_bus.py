@@ -22,7 +22,7 @@ import zenoh
 
 from swarmctl.bus.bus import DEFAULT_LEASE_MS, Bus
 from swarmctl.bus.marked_keys import Inbox, MarkedPublisher, drain
-from swarmctl.bus.refusals import MISDELIVERED, RefusedMessage
+from swarmctl.bus.refusals import MISDELIVERED, MOST_REFUSED, RefusedMessage
 from swarmctl.bus.silence import DEAF_S, SilenceWatch
 from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
 from swarmctl.errors import StartError
@@ -41,7 +41,6 @@ _LINK_OPEN_TIMEOUT_MS = 5000  # of links between routers: one that was cut is ba
 # processor for 2 s, as in a launch on a machine under load, was deaf for good.
 _CLIENT_OPEN_TIMEOUT_MS = 60_000
 _MAX_SOCKET_PATH = 100  # sun_path is 108 bytes
-_MOST_REFUSED = 4096  # kept until they are asked for
 
 COMMON_SETTINGS: dict[str, Any] = {
     "scouting/multicast/enabled": False,
@@ -126,7 +125,7 @@ class ZenohBus(Bus):
         for sender, inbox in self._now.subscribers.get(topic, {}).items():
             payloads, misdelivered = inbox.take()
             arrived += [(sender, p.to_bytes() if len(p) <= most_bytes else TOO_LONG) for p in payloads]
-            if misdelivered and len(self._refused) < _MOST_REFUSED:
+            if misdelivered and len(self._refused) < MOST_REFUSED:
                 self._refused += [RefusedMessage(sender, topic.name, MISDELIVERED)] * misdelivered
         if arrived:
             self._silence.hear()

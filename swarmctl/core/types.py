@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+NO_AGE_US = -1  # of what there is none yet
 MAX_MARGIN_M = 10.0  # limit of the margin in a path, so that one peer cannot ground all others
 Sampled = Callable[[Array], tuple[Array, Array]]  # offsets (K,) [s] from now -> positions, velocities, (K, 3) each
 
@@ -239,7 +240,7 @@ class AttitudeSetpoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """Holds the inputs of the failsafe; ages are -1 before the first sample."""
+    """Holds the inputs of the failsafe; ages are `NO_AGE_US` before the first sample."""
 
     state_age_us: int
     armed: bool

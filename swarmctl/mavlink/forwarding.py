@@ -16,9 +16,8 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.latch import Address
-from swarmctl.mavlink.transport import Datagram, Transport
+from swarmctl.mavlink.transport import MAX_DATAGRAM, Datagram, Transport
 
-_MAX_DATAGRAM = 2048
 _DATAGRAMS_A_POLL = 20  # from each station; the rest waits for the next tick
 _HEADER_BYTES, _COMMAND_AT = 10, 28  # where a payload begins, and the number of the command in it
 _ANY_COMMAND = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
@@ -97,7 +96,7 @@ class Forwarding:
         """Pass on what a station asks, a bounded number of datagrams at once."""
         for _ in range(_DATAGRAMS_A_POLL):
             try:
-                data = sock.recv(_MAX_DATAGRAM)
+                data = sock.recv(MAX_DATAGRAM)
             except BlockingIOError:
                 return
             except OSError:  # what was sent to nobody comes back as an error

@@ -24,7 +24,7 @@ from swarmctl.mavlink.framing import FrameWriter, cut_frames
 from swarmctl.mavlink.latch import Address, Greeting, IsVehicle, Latch, admit_only, anybody, silence
 from swarmctl.wall_clock import utc_us
 
-_MAX_DATAGRAM = 2048
+MAX_DATAGRAM = 2048
 _CHUNK = 65536
 _DATAGRAMS_A_POLL, _BYTES_A_POLL = 600, 131_072  # limits of one tick; the rest waits for the next
 _BUFFER_BYTES = 1 << 20  # as much as the system allows, so that frames survive a pause of the reader
@@ -212,7 +212,7 @@ class UdpTransport:
         left = _BYTES_A_POLL
         for _ in range(_DATAGRAMS_A_POLL):
             try:
-                data, ancillary, _, sender = self._sock.recvmsg(_MAX_DATAGRAM, 64)
+                data, ancillary, _, sender = self._sock.recvmsg(MAX_DATAGRAM, 64)
             except ConnectionRefusedError:
                 continue  # ICMP port unreachable surfaces here once
             except OSError:

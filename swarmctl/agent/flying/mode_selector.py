@@ -16,9 +16,18 @@ from swarmctl.control.fallback import brake_and_hold_plan
 from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Start
 from swarmctl.control.phases.mission_state import MissionState
-from swarmctl.core.types import Array, FlightMode, Health, Landed, Mode, Phase, Plan, PlanStatus, VehicleState
-
-_NO_TIME_US = -1
+from swarmctl.core.types import (
+    NO_AGE_US,
+    Array,
+    FlightMode,
+    Health,
+    Landed,
+    Mode,
+    Phase,
+    Plan,
+    PlanStatus,
+    VehicleState,
+)
 
 
 class ModeSelector:
@@ -128,13 +137,13 @@ class ModeSelector:
     def _health(self, now_us: int, state: VehicleState | None, plan: Plan | None, dead_reckoning_s: float) -> Health:
         good = self._plan_buffer.plan
         return Health(
-            state_age_us=_NO_TIME_US if state is None else max(0, now_us - state.t_us),
+            state_age_us=NO_AGE_US if state is None else max(0, now_us - state.t_us),
             armed=state is not None and state.armed,
             mode=FlightMode.UNKNOWN if state is None else state.mode,
             landed=Landed.UNKNOWN if state is None else state.landed,
             autopilot_failsafe=state is not None and state.failsafe,
             plan_status=PlanStatus.NONE if plan is None else plan.status,
-            last_good_plan_age_us=_NO_TIME_US if good is None else now_us + self._delay_us - good.t0_us,
+            last_good_plan_age_us=NO_AGE_US if good is None else now_us + self._delay_us - good.t0_us,
             planless_us=0 if self._certified_us is None else now_us - self._certified_us,
             speed_m_s=0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
             phase=self._mission.phase,

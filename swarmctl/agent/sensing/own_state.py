@@ -11,7 +11,6 @@ from swarmctl.control.mpc.problem import Start
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.types import Array, FlightMode, VehicleState
 
-_NO_TIME_US = -1
 _AUTOPILOT_HOVER_MODES = (FlightMode.HOLD, FlightMode.EXTERNAL)  # ArduCopter takes off by itself in the latter
 
 
@@ -27,7 +26,7 @@ class OwnState:
         self._estimator, self._predictor = estimator, Predictor(model)
         self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])  # (3,) sent last
         self._thrust_01 = model.hover_thrust_01  # sent last
-        self._taken_us = _NO_TIME_US  # time of the newest state
+        self._taken_us: int | None = None  # time of the newest state
 
     @property
     def delay_us(self) -> int:

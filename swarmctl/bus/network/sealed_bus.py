@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 from swarmctl.bus.bus import Bus, ForwardingBus
 from swarmctl.bus.network.seals import Sealer, SealVerifier
-from swarmctl.bus.refusals import REPLAYED, RefusedMessage
+from swarmctl.bus.refusals import MOST_REFUSED, REPLAYED, RefusedMessage
 from swarmctl.bus.topics import ENDED, FAR_PATH, OBSTACLES, PATH, STATUS, TOO_LONG, TRAJECTORY, Topic
 
 _FOR_FLIGHT_US = 10_000_000  # clocks that are farther apart are not corrected, see `commitment_messages`
@@ -18,7 +18,6 @@ FOR_AGENTS_US: Mapping[str, int] = MappingProxyType(
 )
 # An operator has to understand agents whatever its clock: it stamps orders by what their statuses say.
 FOR_OPERATORS_US: Mapping[str, int] = MappingProxyType(dict.fromkeys((ENDED.name, OBSTACLES.name), _FOR_LISTS_US))
-_MOST_REFUSED = 4096  # kept until they are asked for
 
 
 class SealedBus(ForwardingBus):
@@ -55,7 +54,7 @@ class SealedBus(ForwardingBus):
                 continue  # relays are slower than others
             if not reason:
                 opened.append((sender, payload))
-            elif len(self._refused) < _MOST_REFUSED:
+            elif len(self._refused) < MOST_REFUSED:
                 self._refused.append(RefusedMessage(sender, topic.name, reason))
         return opened
 

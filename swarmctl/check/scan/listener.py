@@ -13,12 +13,19 @@ import sys
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
-from swarmctl.mavlink.transport import Transport, bind_towards, bind_udp, open_transport, parse_url, resolve
+from swarmctl.mavlink.transport import (
+    MAX_DATAGRAM,
+    Transport,
+    bind_towards,
+    bind_udp,
+    open_transport,
+    parse_url,
+    resolve,
+)
 from swarmctl.wall_clock import monotonic_us
 
 Address = tuple[str, int]
 NOWHERE: Address = ("", 0)
-_MAX_DATAGRAM = 2048
 _DATAGRAMS_AT_ONCE = 200  # bounded, so that one flooded link does not starve the others
 _SO_RXQ_OVFL = 40  # Linux: each datagram comes with the number that found the queue full; not in Python's socket
 _COUNT = struct.Struct("@I")
@@ -91,7 +98,7 @@ class UdpListener:
         heard: list[ReceivedDatagram] = []
         for _ in range(_DATAGRAMS_AT_ONCE):
             try:
-                data, ancillary, _, sender = self._sock.recvmsg(_MAX_DATAGRAM, socket.CMSG_SPACE(_COUNT.size))
+                data, ancillary, _, sender = self._sock.recvmsg(MAX_DATAGRAM, socket.CMSG_SPACE(_COUNT.size))
             except ConnectionRefusedError:
                 continue  # ICMP port unreachable surfaces here once
             except OSError:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from swarmctl.core.types import Array, Phase
 
-_GRID_US = 20_000
-_GAP_US = 500_000  # no interpolation between reported positions farther apart in time
-_STALE_MS = _GAP_US / 1e3  # an agent that receives nothing keeps recording the last known position
+GRID_US = 20_000
+GAP_US = 500_000  # no interpolation between reported positions farther apart in time
+_STALE_MS = GAP_US / 1e3  # an agent that receives nothing keeps recording the last known position
 _AGAIN_S = 0.5  # mission time that falls by more begins again; by less, somebody has set the clock
 _AT_REST_M = 0.01  # a reference that moves less in its last ticks has come to rest, and is a goal
 _LAST_TICKS = 10
@@ -138,7 +138,7 @@ def _reported_tracks(ticks: Mapping[int, NDArray[np.void]], agents: int) -> Trac
     first_us, last_us = min(armed_us), max(int(rows["utc_us"].max()) for rows in known.values() if len(rows))
     if last_us - first_us > MAX_RUN_US:
         return nothing
-    t_us = np.arange(first_us, last_us + 1, _GRID_US)
+    t_us = np.arange(first_us, last_us + 1, GRID_US)
     pos_ned_m = np.full((len(t_us), agents, 3), np.nan)
     for agent, rows in known.items():
         pos_ned_m[:, agent] = _reported_positions(rows, "utc_us", t_us)
@@ -159,7 +159,7 @@ def _reported_positions(rows: NDArray[np.void], time_field: str, at_us: NDArray[
     located = rows[_located(rows)]
     age_us = np.clip(located["state_age_ms"].astype(np.float64) * 1e3, 0.0, MAX_RUN_US)
     of_us, newest = np.unique(located[time_field] - np.round(age_us).astype(np.int64), return_index=True)
-    return interpolate(at_us, of_us, located["pos_ned_m"][newest], _GAP_US)
+    return interpolate(at_us, of_us, located["pos_ned_m"][newest], GAP_US)
 
 
 def unseen_spans(rows: NDArray[np.void], time_field: str) -> list[tuple[float, float]]:
@@ -172,8 +172,8 @@ def unseen_spans(rows: NDArray[np.void], time_field: str) -> list[tuple[float, f
     t_us, armed, located = rows[time_field].astype(np.float64), rows["armed"] != 0, _located(rows)
     age_us = np.where(located, rows["state_age_ms"] * 1e3, np.nan)
     unseen = armed & ~(located & (rows["state_age_ms"] <= _STALE_MS))
-    ticks_missing = (np.diff(t_us) > _GAP_US) & (armed[:-1] | armed[1:])
-    states_missing = (np.diff(t_us - age_us) > _GAP_US) & armed[:-1] & armed[1:]
+    ticks_missing = (np.diff(t_us) > GAP_US) & (armed[:-1] | armed[1:])
+    states_missing = (np.diff(t_us - age_us) > GAP_US) & armed[:-1] & armed[1:]
     hidden = unseen[:-1] | unseen[1:] | ticks_missing | states_missing  # (T - 1,) of the times between rows
     edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]])))
     return [(float(t_us[first]), float(t_us[end])) for first, end in edges.reshape(-1, 2)]
@@ -198,7 +198,7 @@ def true_positions(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) 
     if not len(truth):
         return _reported_positions(rows, "t_us", rows["t_us"])
     own = truth[truth["vehicle"] == agent]
-    return interpolate(rows["t_us"], own["t_us"], own["pos_ned_m"], _GAP_US)
+    return interpolate(rows["t_us"], own["t_us"], own["pos_ned_m"], GAP_US)
 
 
 def shared_references(ticks: Mapping[int, NDArray[np.void]]) -> dict[int, list[int]]:

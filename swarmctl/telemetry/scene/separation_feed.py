@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array
-from swarmctl.telemetry.evaluation.tracks import interpolate
+from swarmctl.telemetry.evaluation.tracks import GAP_US, GRID_US, interpolate
 
-_GRID_US = 20_000
-_GAP_US = 500_000
 _SILENT_US = 1_000_000
 
 
@@ -39,13 +37,13 @@ class SeparationFeed:
         until_us = min(ends_us[agent] for agent in live)
         if self._next_us is None:
             self._next_us = max(int(self._t_us[agent][0]) for agent in live)
-        grid_us = np.arange(self._next_us, until_us + 1, _GRID_US)
+        grid_us = np.arange(self._next_us, until_us + 1, GRID_US)
         if len(live) < 2 or not len(grid_us):
             return np.zeros(0, np.int64), np.zeros(0)
-        at = [interpolate(grid_us, self._t_us[agent], self._pos_ned_m[agent], _GAP_US) for agent in live]
+        at = [interpolate(grid_us, self._t_us[agent], self._pos_ned_m[agent], GAP_US) for agent in live]
         least_m = closest_pair_m(np.stack(at, axis=1))
-        self._next_us = int(grid_us[-1]) + _GRID_US
-        self._forget(self._next_us - _GAP_US)
+        self._next_us = int(grid_us[-1]) + GRID_US
+        self._forget(self._next_us - GAP_US)
         known = np.isfinite(least_m)
         return grid_us[known], least_m[known]
 
