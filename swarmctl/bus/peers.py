@@ -20,8 +20,8 @@ from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
 from swarmctl.bus.topics import PATH, Topic
 from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
 
-MAX_AGE_US = 2_000_000
-MAX_LEAD_US = 500_000
+_MAX_AGE_US = 2_000_000  # a path whose first point is older when it arrives is refused
+MAX_LEAD_US = 500_000  # likewise one whose first point is further in the future
 
 
 def peer_verifiers(
@@ -37,8 +37,6 @@ class PeerPaths:
     Args:
         peers: numbers of the other agents.
         rate_hz, refusals, presence: see `SenderVerifier`.
-        max_age_us: a path whose first point is older than this when it arrives is refused.
-        max_lead_us: a path whose first point is further in the future than this is refused.
         clocks: by which paths are converted to the own clock; None takes all clocks for equal.
 
     Attributes:
@@ -52,14 +50,10 @@ class PeerPaths:
         refusals: Refusals,
         presence: Presence,
         *,
-        max_age_us: int = MAX_AGE_US,
-        max_lead_us: int = MAX_LEAD_US,
         clocks: PeerClocks | None = None,
     ) -> None:
         peers = tuple(peers)
         self._verifiers = peer_verifiers(peers, PATH, rate_hz, refusals, presence=presence)
-        self._max_age_us = max_age_us
-        self._max_lead_us = max_lead_us
         self._clocks = clocks
         self._newest: dict[int, PredictedPath] = {}  # in the order of agent numbers
         self._near_since_us: dict[int, int] = dict.fromkeys(peers, 0)  # those within reach
@@ -138,6 +132,6 @@ class PeerPaths:
             return IDENTITY
         if path.agent not in self._verifiers:
             return UNKNOWN_PEER
-        if path.t0_utc_us - utc_us > self._max_lead_us:
+        if path.t0_utc_us - utc_us > MAX_LEAD_US:
             return FUTURE
-        return LATE if utc_us - path.t0_utc_us > self._max_age_us else ""
+        return LATE if utc_us - path.t0_utc_us > _MAX_AGE_US else ""

@@ -183,13 +183,12 @@ class Reference:
 class PlanTimes:
     """Holds measured times of planning, which have no influence."""
 
-    setup_us: float  # matrices
     solve_us: float  # inside the QP solver
     certify_us: float
     spaces_us: float = 0.0  # half-spaces
 
 
-NO_TIMES = PlanTimes(setup_us=0.0, solve_us=0.0, certify_us=0.0)
+NO_TIMES = PlanTimes(solve_us=0.0, certify_us=0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -50,14 +50,13 @@ class Latch:
 
     Attributes:
         remote: address of the vehicle; None before its first datagram.
-        strangers: number of datagrams of other senders that the kernel has let through.
         moves: number of address changes that have been followed.
     """
 
     def __init__(self, is_vehicle: IsVehicle, remote: Address | None = None) -> None:
         self._is_vehicle = is_vehicle
         self.remote = remote
-        self.strangers = self.moves = 0
+        self.moves = 0
         self._received_us: int | None = None  # last datagram of the vehicle, or begin of the wait for it
         self._polled_us: int | None = None
 
@@ -79,7 +78,6 @@ class Latch:
             self._received_us = self._polled_us
             return True
         if (self.remote is not None and not self._is_stale) or not self._is_vehicle(data):
-            self.strangers += 1
             return False
         self.moves += self.remote is not None
         self.remote, self._received_us = sender, self._polled_us

@@ -83,7 +83,7 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
-def router_command(config: Config, context: RunContext, links: RouterLinks | None) -> Command:
+def router_command(context: RunContext, links: RouterLinks | None) -> Command:
     """Return the command of the bus router, with its links to other computers if there are any."""
     argv = module_command("swarmctl.bus.network.router", context.endpoint, "--die-with-parent")
     argv += links.arguments() if links is not None else ()

@@ -83,8 +83,8 @@ class Recording:
         self._controller.reset()
 
 
-def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = MOST_PROBLEMS) -> Captured:
-    """Fly `config` in lockstep and keep up to `most` tracking problems with exactly `keep_outs` things to avoid.
+def capture(config: Config, most: int = MOST_PROBLEMS) -> Captured:
+    """Fly `config` in lockstep and keep up to `most` tracking problems with everything to avoid that there is.
 
     They are consecutive, agent after agent.
     """
@@ -98,7 +98,7 @@ def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = MOST_PR
 
     def enough(flown: Lockstep) -> bool:
         for agent, recording, kept in zip(agents, recordings, found, strict=True):
-            kept += [(p, agent.timing.tick_ms) for p in recording.problems if len(p.keep_outs) == keep_outs]
+            kept += [(p, agent.timing.tick_ms) for p in recording.problems if len(p.keep_outs) == _MAX_KEEP_OUTS]
             recording.problems.clear()
         return len(found[0]) >= most or all(log.rows[-1]["phase"][0] > Phase.TRACK for log in flown.logs)
 
@@ -172,10 +172,6 @@ class Baseline:
     @property
     def solved_01(self) -> float:
         return float(self.solved.mean())
-
-    @property
-    def kept_01(self) -> float:
-        return float(self.kept.mean())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

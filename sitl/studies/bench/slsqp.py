@@ -99,17 +99,9 @@ class NonlinearXy:
         self._dz2 = ((z_ned_m - others[:, 2]) * flat[:, None]) ** 2  # (K, Hp)
         self._radius_m = np.array([k.radius_m for k in keep_outs])[:, None]
 
-    def positions_m(self, moves: Array) -> Array:
-        """Return positions (Hp, 2) [m] at steps 1..Hp."""
-        return np.asarray((self._free_m + self._push @ moves).reshape(2, -1).T)
-
     def shortfall_m(self, moves: Array) -> float:
         """Return the largest violation of a distance [m]."""
         return float(np.max(-self.margins_m(moves), initial=0.0))
-
-    def moves_of(self, u: Array) -> Array:
-        """Return the increments (2 Hc,) from the held input to inputs (>= Hc, 2)."""
-        return np.asarray(np.diff(u[: self._hc], axis=0, prepend=self._u_prev[None]).T.ravel())
 
     def inputs(self, moves: Array) -> Array:
         """Return the inputs (Hc, 2) that increments make of the held ones."""

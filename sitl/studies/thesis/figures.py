@@ -151,9 +151,9 @@ def draw(figure: Figure, traces: Sequence[Trace], points: int = 300) -> Markup:
     return time_chart(title, lines, _seconds(traces), points=points, windows=windows, height=200)
 
 
-def body_rates_rad_s(trace: Trace, agent: int = 0) -> Array:
-    """Return body FRD rates p, q, r (T, 3) [rad/s] by central differences of the angles; a trace has no rates."""
-    euler_rad = trace.euler_rad[:, agent]
+def body_rates_rad_s(trace: Trace) -> Array:
+    """Return body FRD rates p, q, r (T, 3) [rad/s] of the first agent, by central differences: a trace has none."""
+    euler_rad = trace.euler_rad[:, 0]
     if len(euler_rad) < 2:
         return np.full_like(euler_rad, np.nan)
     roll, pitch = euler_rad[:, 0], euler_rad[:, 1]
@@ -167,10 +167,10 @@ def body_rates_rad_s(trace: Trace, agent: int = 0) -> Array:
     )
 
 
-def body_velocity_m_s(trace: Trace, agent: int = 0) -> Array:
-    """Return the body FRD velocity u, v, w (T, 3) [m/s]: the NED velocity turned by the ZYX angles."""
-    to_ned = Rotation.from_euler("ZYX", trace.euler_rad[:, agent, ::-1])
-    return np.asarray(to_ned.apply(trace.vel_ned_m_s[:, agent], inverse=True))
+def body_velocity_m_s(trace: Trace) -> Array:
+    """Return the body FRD velocity u, v, w (T, 3) [m/s] of the first agent: that in NED, turned by the ZYX angles."""
+    to_ned = Rotation.from_euler("ZYX", trace.euler_rad[:, 0, ::-1])
+    return np.asarray(to_ned.apply(trace.vel_ned_m_s[:, 0], inverse=True))
 
 
 def separation_chart(

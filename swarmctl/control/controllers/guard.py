@@ -145,7 +145,7 @@ class Guard:
             pos_ned_m=pos,
             vel_ned_m_s=vel,
             virtual_control=np.array([vehicle.bounded(command) for command in commands]),
-            times=PlanTimes(setup_us=0.0, solve_us=took_s * 1e6, certify_us=0.0),
+            times=PlanTimes(solve_us=took_s * 1e6, certify_us=0.0),
             traceback=self._untold(),
             by_own=True,
         )

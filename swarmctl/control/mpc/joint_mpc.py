@@ -54,7 +54,6 @@ class JointMpc:
 
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
-        began_ns = self._setup.stopwatch_ns()
         guess = first_guess(problem, self._params.dt_s, self.steps)
         near = partial(
             near_half_spaces,
@@ -65,13 +64,13 @@ class JointMpc:
             dt_s=self._params.dt_s,
             own_priority_id=self._setup.agent,
         )
-        return planned(near, partial(self._plan, problem, began_ns), self._setup.separation, self._setup.stopwatch_ns)
+        return planned(near, partial(self._plan, problem), self._setup.separation, self._setup.stopwatch_ns)
 
     def reset(self) -> None:
         """Keep all: only a warm start outlasts a tick."""
         return
 
-    def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
+    def _plan(self, problem: Problem, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
         start, steps, ahead = problem.start, self.steps, self._mpc.prediction
         acting = _joined(start.tilt, start.virtual_control[2]), _joined(start.tilt_rate_1_s, 0.0)
         drift_m_s2 = problem.disturbance_ned_m_s2 + GRAVITY_NED_M_S2
@@ -92,7 +91,6 @@ class JointMpc:
             solutions=(found,),
             from_step=first_row,
             dt_us=self.dt_us,
-            began_ns=began_ns,
             spaces_us=spaces_us,
             stopwatch_ns=stopwatch_ns,
             volume=self._setup.volume,

@@ -23,7 +23,6 @@ def judged(
     solutions: Sequence[AxesSolution],
     from_step: int,
     dt_us: int,
-    began_ns: int,
     spaces_us: float,
     stopwatch_ns: Callable[[], int],
     volume: FlightVolume | None,
@@ -37,7 +36,6 @@ def judged(
         solutions: solutions of all problems solved for it.
         from_step: first certified step; earlier ones cannot be changed any more.
         dt_us: step.
-        began_ns: stopwatch reading at the start of planning.
         spaces_us: time that half-spaces took.
         stopwatch_ns: see `CondensedMpc`.
         volume: to stay in; None for none.
@@ -50,7 +48,6 @@ def judged(
         status = PlanStatus.RESIDUAL
     else:
         status = _certified(problem, pos_ned_m, vel_ned_m_s, from_step, volume)
-    solve_us = sum([s.solve_us for s in solutions])
     certify_us = (stopwatch_ns() - solved_ns) * 1e-3
     return Plan(
         status=status,
@@ -59,12 +56,7 @@ def judged(
         pos_ned_m=pos_ned_m,
         vel_ned_m_s=vel_ned_m_s,
         virtual_control=virtual_control,
-        times=PlanTimes(
-            setup_us=(solved_ns - began_ns) * 1e-3 - solve_us - spaces_us,
-            solve_us=solve_us,
-            certify_us=certify_us,
-            spaces_us=spaces_us,
-        ),
+        times=PlanTimes(solve_us=sum([s.solve_us for s in solutions]), certify_us=certify_us, spaces_us=spaces_us),
         iterations=sum([s.iterations for s in solutions]),
         slack_m=max([s.slack_m for s in solutions]),
         residual_m=residual_m,

@@ -176,7 +176,6 @@ class SwarmMpc:
 
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
-        began_ns = self._setup.stopwatch_ns()
         self._before = self._newest
         up = self._solve_z(problem)
         guess = first_guess(problem, self._params.dt_s, self.steps)
@@ -192,18 +191,13 @@ class SwarmMpc:
             own_priority_id=self._setup.agent,
         )
 
-        def plan(spaces: HalfSpaces | None, spaces_us: float) -> Plan:
-            return self._plan(problem, up, began_ns, spaces, spaces_us=spaces_us)
-
-        return planned(near, plan, self._setup.separation, self._setup.stopwatch_ns)
+        return planned(near, partial(self._plan, problem, up), self._setup.separation, self._setup.stopwatch_ns)
 
     def reset(self) -> None:
         """Forget the newest plan; solvers keep their warm starts."""
         self._newest = None
 
-    def _plan(
-        self, problem: Problem, up: AxesSolution, began_ns: int, spaces: HalfSpaces | None, *, spaces_us: float
-    ) -> Plan:
+    def _plan(self, problem: Problem, up: AxesSolution, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
         start, steps, count = problem.start, self.steps, min(self.steps, len(up.pos_m))
         asked = AxesProblem(
             pos_m=start.pos_ned_m[:2],
@@ -233,7 +227,6 @@ class SwarmMpc:
             solutions=(up, across),
             from_step=self._first_row,
             dt_us=self.dt_us,
-            began_ns=began_ns,
             spaces_us=spaces_us,
             stopwatch_ns=self._setup.stopwatch_ns,
             volume=self._setup.volume,

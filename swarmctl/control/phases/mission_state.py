@@ -76,7 +76,6 @@ class MissionState:
         landing_seen: the autopilot lands, or has.
         outcome_before: outcome before the override, restored by resume.
         first_tick_us: monotonic time from which the patience with the start counts.
-        entered_us: monotonic time at which the phase was entered.
         land_by_us: monotonic time at which a vehicle that is not at its landing place by then lands where it is.
         requested_us: monotonic time of the newest request to the autopilot.
     """
@@ -88,7 +87,7 @@ class MissionState:
         self.duration_us = round(setup.duration_s * 1e6)
         self.phase, self.boots = Phase.CONNECT, 0
         self.outcome = self.outcome_before = self.waits_for = self.stop_verb = ""
-        self.ready_utc_us = self.ordered_begin_utc_us = self.entered_us = self.overridden_us = 0
+        self.ready_utc_us = self.ordered_begin_utc_us = self.overridden_us = 0
         self.resumed_us = self.land_by_us = 0
         self.begin_utc_us: int | None = None
         self.gone_us: int | None = None
@@ -214,7 +213,6 @@ class MissionState:
         self.phase = phase
         if phase >= Phase.LAND:
             self.interruptions.end_hold()
-        self.entered_us = now_us
         self.requested_us = now_us - SPIN_UP_US
 
     def may_request(self, inputs: PhaseInputs, every_us: int = REQUEST_PERIOD_US) -> bool:

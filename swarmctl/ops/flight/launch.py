@@ -205,7 +205,7 @@ class Launcher(Services):
         """
         config, context, reserved = self._config, self.context, self._reserved
         socket_file(context.endpoint)
-        self._spawn(router_command(config, context, self._links))
+        self._spawn(router_command(context, self._links))
         self.bus = self._join_bus()
         if reserved.view_port:
             options = self._options
@@ -240,7 +240,7 @@ class Launcher(Services):
 
     def restart_router(self) -> None:
         """Start the router again where the ended one was; everybody's session finds it by itself."""
-        self._spawn(router_command(self._config, self.context, self._links))
+        self._spawn(router_command(self.context, self._links))
 
     def stop(self, agents_grace_s: float) -> None:
         """End every process, agents first and the router last, and remove all temporary files. Safe at any point."""

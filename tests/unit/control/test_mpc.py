@@ -256,13 +256,13 @@ def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_
     assert kept.virtual_control[5, 0] > 0.02  # away from the neighbour that is too near
 
 
-def test_times_are_measured_with_the_stopwatch_and_add_up() -> None:
+def test_times_are_measured_with_the_stopwatch() -> None:
     now_ns = iter(range(0, 10**9, 1000))  # every reading is 1 us after the last
     mpc = SwarmMpc(MpcParams(), builders.controller_setup(stopwatch_ns=lambda: next(now_ns)))
     neighbour = fixed(HERE + np.array([1.3, 0.0, 0.0]))
     times = mpc.plan(problem((0.1, 0.0, 0.0), neighbour)).times
-    # read at the start, round both solves and the half-spaces, after them, and after the certificate: eight intervals
-    assert (times.setup_us, times.spaces_us, times.solve_us, times.certify_us) == (4.0, 1.0, 2.0, 1.0)
+    # read round both solves, the half-spaces and the certificate
+    assert (times.spaces_us, times.solve_us, times.certify_us) == (1.0, 2.0, 1.0)
 
 
 @pytest.mark.parametrize("horizon_z", [3, 40])
