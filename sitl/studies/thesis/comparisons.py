@@ -21,6 +21,7 @@ from sitl.studies.thesis.experiments import (
     radius_name,
 )
 from sitl.studies.thesis.trace import Row, Trace
+from swarmctl.telemetry.evaluation.referee import STEADY_AFTER_S
 
 TRIANGLE = "an equilateral triangle around the reference: sqrt(3) r"
 NO_LESS = "by definition"
@@ -33,7 +34,7 @@ def lower_bound_index_m(radius_m: float) -> float:
 
 def settled_over_bound(radius_m: float) -> Callable[[Trace], float]:
     """Return the figure of the index after the start-up, over its lower bound."""
-    return lambda trace: score.index_m(trace, score.STEADY_AFTER_S) / lower_bound_index_m(radius_m)
+    return lambda trace: score.index_m(trace, STEADY_AFTER_S) / lower_bound_index_m(radius_m)
 
 
 def true_distance_rows(flown: Flown) -> Iterator[Row]:

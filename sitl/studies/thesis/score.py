@@ -9,8 +9,7 @@ import numpy as np
 
 from sitl.studies.thesis.trace import Array, Trace
 from swarmctl.core.closest_pair import closest_pair_m
-
-STEADY_AFTER_S = 10.0
+from swarmctl.telemetry.evaluation.referee import STEADY_AFTER_S
 
 
 def mean_distance_m(trace: Trace) -> float:

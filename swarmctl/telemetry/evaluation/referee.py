@@ -43,6 +43,7 @@ from swarmctl.telemetry.evaluation.tracks import (
 )
 
 SUMMED_ERROR = "distances of all agents to their reference, added up; mean over the mission"  # what `index_m` is
+STEADY_AFTER_S = 10.0  # mission time from which `steady_rmse_m` and `index_after_10s_m` are computed
 _MAX_LISTED = 10  # largest number of violations of one kind listed in full
 _DURATION_SLACK_S = 1.0  # mission time that may be missing at the end of a completed run
 
@@ -92,7 +93,6 @@ def evaluate(
     problems: Sequence[str] = (),
     *,
     speed_factor: float | None = None,
-    steady_after_s: float = 10.0,
 ) -> dict[str, Any]:
     """Return the figures and violations of a run as the content of `summary.json`.
 
@@ -102,7 +102,6 @@ def evaluate(
         outcome: "completed" | "failed" | "interrupted", as reported by the launcher.
         problems: problems reported by the launcher in words; each is a violation.
         speed_factor: simulated seconds per wall second.
-        steady_after_s: mission time from which `steady_rmse_m` and `index_after_10s_m` are computed.
     """
     clocked = by_station_clock(run.ticks, run.events)
     run, known = replace(run, ticks=clocked.ticks), clocked.known
@@ -114,7 +113,7 @@ def evaluate(
     obstacles, clear = _evaluate_obstacles(tracks, rules, clock)
     volume, inside = _evaluate_volume(run, tracks, rules, clock)
     timing, punctual = _evaluate_timing(run.ticks, rules, speed_factor)
-    tracking, tracked_s = _evaluate_tracking(run, rules.agents, steady_after_s)
+    tracking, tracked_s = _evaluate_tracking(run, rules.agents)
     unseen = [] if len(run.truth) else [*clocked.problems(), *_unseen(clocked, rules.agents, clock)]
     refused = _shorten(list(refused_peers(run.events)))
     configured = dict(enumerate(rules.goals_ned_m))
@@ -316,7 +315,7 @@ def _evaluate_timing(
     return timing, []
 
 
-def _evaluate_tracking(run: RunData, agents: int, steady_after_s: float) -> tuple[dict[str, Any], dict[int, float]]:
+def _evaluate_tracking(run: RunData, agents: int) -> tuple[dict[str, Any], dict[int, float]]:
     """Return tracking errors and, for each agent, the time of its newest mission that it tracked [s].
 
     The index of thesis Table 19 is the summed mean tracking error: the sum over agents of the distance to the shared
@@ -326,7 +325,7 @@ def _evaluate_tracking(run: RunData, agents: int, steady_after_s: float) -> tupl
     errors = {agent: error for agent, error in errors.items() if len(error.mission_t_s)}
     rows = []
     for agent, error in errors.items():
-        steady = error.mission_t_s >= steady_after_s
+        steady = error.mission_t_s >= STEADY_AFTER_S
         rows.append(
             {
                 "id": agent,
@@ -340,7 +339,7 @@ def _evaluate_tracking(run: RunData, agents: int, steady_after_s: float) -> tupl
     if len(errors) == agents:
         first_s = max(error.mission_t_s[0] for error in errors.values())
         last_s = min(error.mission_t_s[-1] for error in errors.values())
-        spans = [(first_s, last_s), (max(first_s, steady_after_s), last_s)]
+        spans = [(first_s, last_s), (max(first_s, STEADY_AFTER_S), last_s)]
         summed_m = (_summed_mean_error_m(errors, *spans[0]), _summed_mean_error_m(errors, *spans[1]))
     tracked_s = {agent: error.tracked_s for agent, error in errors.items()}
     return {"index_m": summed_m[0], "index_after_10s_m": summed_m[1], "agents": rows}, tracked_s

@@ -12,6 +12,7 @@ import pytest
 from sitl.studies.thesis import score
 from sitl.studies.thesis.trace import Array, Row, Trace
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.telemetry.evaluation.referee import STEADY_AFTER_S
 
 DT_S = 0.02
 REFERENCE_NED_M = np.array([10.0, -20.0, -5.0])  # far off zero: a figure of positions would show
@@ -75,7 +76,7 @@ def test_steady_rmse_counts_a_constant_offset() -> None:
 
 def test_the_sample_at_10_s_is_steady_and_the_one_before_is_not() -> None:
     at = late(0.0, (0.0, 0.0, 0.0))
-    assert at.t_s[500] == score.STEADY_AFTER_S
+    assert at.t_s[500] == STEADY_AFTER_S
     at.pos_ned_m[499, 0, 0] += 1.0
     assert score.steady_rmse_m(at) == 0.0
     at.pos_ned_m[500, 0, 0] += 1.0
