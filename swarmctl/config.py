@@ -69,7 +69,7 @@ from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 
 NO_VALUES: Mapping[str, Any] = MappingProxyType({})
 _NUMBERS = re.compile(r"\[\n((?: +[-+.\w]+,\n)+) *\]")  # an array of numbers as tomli_w writes it: one on each line
-_RENAMED = {  # keys of versions before 0.2
+_RENAMED = {  # today's keys by former ones, which are refused with this as the hint
     "agent.commit.bias_rad": "agent.commit.right_of_way_rad",
     "agent.commit.share_01": "agent.commit.tilt_fraction_01",
     "agent.detour": "agent.deadlock",
