@@ -59,7 +59,7 @@ class Phase(enum.IntEnum):
 
 
 class Mode(enum.IntEnum):
-    """Mode of the agent in a tick, decided by `control.phases.failsafe` from `Health`."""
+    """Mode of the agent in a tick, decided by `control.failsafe.decision` from `Health`."""
 
     IDLE = 0  # nothing is sent: before take-off, after landing
     PRIMING = 1  # setpoints flow but the autopilot still flies

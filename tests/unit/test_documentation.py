@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import re
 import runpy
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ import pytest
 import swarmctl
 from sitl.studies.campaign.trials import SCHEMA
 from sitl.studies.sweep.figures import schema_of
+from swarmctl.configuration.keys import sections
 from swarmctl.configuration.sections import SitlParams
 from swarmctl.control.controllers.own import GROUP as CONTROLLERS_OFFERED
 from swarmctl.control.reference.mission import GROUP as MISSIONS_OFFERED
@@ -20,10 +23,13 @@ from swarmctl.core.operator_verbs import OPERATOR_VERBS
 from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Phase
 from swarmctl.ops.supervision.supervisor import ESSENTIAL_ENDED
+from swarmctl.telemetry.recording.file_names import RECORDING
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 QUOTED = re.compile(r"`([^`\s]+)`")
+PACKAGES = "|".join(path.parent.name for path in (ROOT / "swarmctl").glob("*/__init__.py"))
+IN_PACKAGE = re.compile(rf"({PACKAGES})(\.[a-z]\w*)+")  # a module by its name within the bridge
 FOLDERS = ("swarmctl/", "sitl/", "tests/", "tools/", "configs/", "docs/")
 
 
@@ -93,6 +99,29 @@ def described() -> set[str]:
 def test_quoted_files_and_modules_exist(page: Path) -> None:
     missing = [name for name in QUOTED.findall(page.read_text()) if is_ours(name) and not exists(name)]
     assert missing == []
+
+
+def test_files_and_modules_that_docstrings_quote_exist() -> None:
+    keys = {key.path for section in sections() for key in section.keys}
+    missing = set()
+    for path in (path for folder in ("swarmctl", "sitl", "tests", "tools") for path in (ROOT / folder).rglob("*.py")):
+        quoted = {name for text in docstrings(path) for name in QUOTED.findall(text)} - keys - {RECORDING}
+        names = {f"swarmctl.{name}" if IN_PACKAGE.fullmatch(name) else name for name in quoted}
+        missing |= {(path.name, name) for name in names if is_ours(name) and not (exists(name) or is_in_module(name))}
+    assert missing == set()
+
+
+def docstrings(path: Path) -> Iterator[str]:
+    """Yield the docstrings of a file: of the module, its classes and functions."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            yield ast.get_docstring(node) or ""
+
+
+def is_in_module(name: str) -> bool:
+    """Return whether this is a class, function or constant of a module."""
+    module, _, member = name.rpartition(".")
+    return is_module(module) and hasattr(importlib.import_module(module), member)
 
 
 def test_what_troubleshooting_quotes_is_said_by_the_code() -> None:

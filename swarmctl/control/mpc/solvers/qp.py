@@ -1,6 +1,6 @@
 """The QP solver interface: minimise 1/2 x'Px + q'x subject to l <= Ax <= u, with a fixed sparsity pattern.
 
-Solvers are in `qp_osqp.py` and `qp_daqp.py`, and `solvers.py` makes the one that a configuration asks for.
+Solvers are in `qp_osqp.py` and `qp_daqp.py`, and `registry.py` makes the one that a configuration asks for.
 """
 
 from __future__ import annotations
