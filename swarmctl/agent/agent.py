@@ -76,7 +76,7 @@ class Agent:
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
 
     def _make_senses(self, setup: AgentSetup) -> None:
-        """Make what receives, senses and watches, and the state mission."""
+        """Make what senses and watches, the state machine of the mission, and what obeys the operators."""
         ports, alerts = self._ports, self._alerts
         self._vehicle_setup = make_vehicle_setup(setup, ports)
         self._world_model = make_world_model(setup, ports)
