@@ -115,6 +115,6 @@ _COLUMNS: tuple[_Column, ...] = (
     ("relative to lower bound", lambda s: _number(s.sum_relative, " x")),
     ("plans failed", lambda s: _number(s.plans_failed, digits=1) if s.plans_failed else ""),
     ("commits refused", lambda s: _number(s.commits_refused, digits=1) if s.commits_refused else ""),
-    ("barrier acted", lambda s: _number(s.safety_filter_acted, digits=1) if s.safety_filter_acted else ""),
+    ("safety filter acted", lambda s: _number(s.safety_filter_acted, digits=1) if s.safety_filter_acted else ""),
     ("CPU a run", lambda s: _number(s.cpu_s, " s", 1)),
 )
