@@ -182,7 +182,7 @@ class Child:
     """A started process. Start it from the main thread: the kernel ties its life to the thread that did."""
 
     def __init__(self, command: Command, directory: Path) -> None:
-        self.name, self.argv = command.name, command.argv
+        self.name, self.argv, self.agents = command.name, command.argv, command.agents
         self.log = directory / f"{command.name}.log"
         self.ended_s: float | None = None
         try:

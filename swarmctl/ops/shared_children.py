@@ -28,7 +28,7 @@ class SharedAgent(Child):
 
     def __init__(self, agent: int, host: Child, ends: EndReader) -> None:  # starts no process of its own
         self.name, self.argv, self.log, self.pid = agent_name(agent), host.argv, host.log, host.pid
-        self.ended_s = None
+        self.agents, self.ended_s = (agent,), None
         self.process = host.process
         self._agent, self._ends = agent, ends
 

@@ -245,7 +245,7 @@ class Launcher(Services):
     def stop(self, agents_grace_s: float) -> None:
         """End every process, agents first and the router last, and remove all temporary files. Safe at any point."""
         router = [child for name, child in self.children.items() if name == ROUTER]
-        agents = [child for name, child in self.children.items() if name.startswith(agent_name(0)[:-1])]
+        agents = [child for child in self.children.values() if child.agents]
         others = [child for child in self.children.values() if child not in router + agents]
         end_all(agents, agents_grace_s)
         end_all(self._shared, _SHARED_STOP_S)

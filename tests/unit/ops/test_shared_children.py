@@ -40,6 +40,7 @@ def until_ended(agent: SharedAgent) -> int:
 
 def test_one_agent_ends_and_the_other_flies_on_until_it_is_sent_a_signal(tmp_path: Path) -> None:
     first, second = started(SAYS + "time.sleep(60)", tmp_path)
+    assert (first.agents, second.agents) == ((0,), (1,))
     assert until_ended(first) == 4
     assert first.ended_s is not None
     assert (first.last_line(), first.how_it_ended()) == ("silent", "ended with exit code 4: silent")

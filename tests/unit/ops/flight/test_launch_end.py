@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -26,7 +27,7 @@ from swarmctl.ops.orders.obstacle_list import read_obstacles
 from swarmctl.ops.orders.operator import joined, read_statuses
 from swarmctl.ops.orders.order_delivery import deliver
 from swarmctl.ops.preflight import ReservedPorts
-from swarmctl.ops.processes import ROUTER
+from swarmctl.ops.processes import ROUTER, Command
 from swarmctl.ops.running_launches import RunningLaunch, announce, find_launch
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.wall_clock import WallClock
@@ -128,6 +129,19 @@ def test_a_launch_is_ending_from_the_end_of_its_agents_until_its_report_is_writt
     assert (others, router, report) == ("ending",) * 3
     with pytest.raises(StartError, match="no launch runs"):
         find_launch(None)
+
+
+def test_agents_are_ended_first_whatever_their_processes_are_called(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ended: list[list[str]] = []
+    monkeypatch.setattr(launching, "end_all", lambda children, grace_s: ended.append([one.name for one in children]))
+    monkeypatch.setattr(launching, "Child", lambda command, folder: SimpleNamespace(poll=lambda: 0, **asdict(command)))
+    services = launcher(tmp_path)
+    for name, agents in ((ROUTER, ()), ("agent-view", ()), ("three", (3,)), ("agent-4", (4,))):
+        services._spawn(Command(name, (), agents=agents))
+    services.stop(0.0)
+    assert ended == [["three", "agent-4"], [], ["agent-view"], [ROUTER]]
 
 
 def test_an_end_that_can_not_be_announced_is_one_all_the_same(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
