@@ -9,9 +9,9 @@ from swarmctl.control.mpc.problem import Start
 from swarmctl.core.frames import GRAVITY_NED_M_S2
 from swarmctl.core.types import Array, Plan, PlanStatus
 
-_DAMPING_1_S = 4.0
+_DAMPING_1_S = 4.0  # the last 0.75 m/s die out in 0.25 s, without oscillation by a lag of up to half as much
 _DAMPING_RAD = 0.5  # damping times lag: more would oscillate
-_ACCEL_MAX_M_S2 = 3.0
+_ACCEL_MAX_M_S2 = 3.0  # a tilt of 17 degrees; what peers expect by default (`separation.brake_m_s2`)
 _LEAST_COS_TILT = 0.3  # what thrust is raised for: it is finite whatever tilt the plan begins with
 _TILT_RATE_1_S = 2.5  # of (u_x, u_y): faster attitude changes would saturate rotors
 

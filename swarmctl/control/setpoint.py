@@ -14,7 +14,7 @@ VALID_US = 100_000  # a setpoint is stale after this time
 HELD_MAX_US = 200_000  # longest time for which a setpoint is expected to be held
 _SUNK_M = 0.3  # below the reference; more than a gust costs that thrust makes good again
 _CLIMB_1_S2 = 2.0  # vertical acceleration left for each metre more
-_CLIMB_MAX_M_S2 = 1.0
+_CLIMB_MAX_M_S2 = 1.0  # with 15 m/s2 of thrust it leaves 0.69 of tilt against the wind, level flight 0.76
 _ATTITUDES = {"swing_twist": quat_of_tilt, "euler": quat_from_body_z}  # by `vehicle_model.heading`
 
 
