@@ -60,9 +60,9 @@ from swarmctl.wall_clock import WallClock, utc_us
 
 _BUS_S = 20.0  # timeout for the router to answer
 _BUS_TRY_MS = 500
-_LAND_S = 30.0
 _CLOCK_TOLD_US = 100_000  # change of the clock that operators' commands are told
 _STOP_S = 10.0  # time for viewer and simulator to write their files
+_AGENTS_STOP_S = 30.0  # time to land for agents of a launch that did not come up, or broke off
 _ROUTER_STOP_S = 3.0
 _SHARED_STOP_S = 3.0  # time for a process to end after the last of its agents
 
@@ -144,7 +144,7 @@ def started(config: Config, options: LaunchOptions, part: SwarmPart) -> Iterator
         services.start()
         yield services
     except BaseException:
-        services.stop(_LAND_S)  # agents still get time to land
+        services.stop(_AGENTS_STOP_S)
         withdraw()
         raise
     else:
