@@ -15,6 +15,7 @@ from typing import Any
 from pymavlink.dialects.v20 import development as mav
 
 from sitl.arducopter.autopilot import FORCE_ARM, FORCE_DISARM, ArduCopter
+from sitl.arducopter.modes import CopterMode
 from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
 from sitl.arducopter.streams import ALL_GROUPS, STREAMS, CopterReport, Intervals
@@ -94,9 +95,9 @@ class ArduCopterEndpoint:
             mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
             mav.MAV_CMD_DO_SET_MODE: lambda p: self._set_mode(_whole(p[0]), _whole(p[1])),
             mav.MAV_CMD_NAV_TAKEOFF: lambda p: self._pilot.take_off(p[6]),
-            mav.MAV_CMD_NAV_LAND: lambda _: self._pilot.set_mode(9),
-            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: self._pilot.set_mode(6),
-            mav.MAV_CMD_NAV_LOITER_UNLIM: lambda _: self._pilot.set_mode(5),
+            mav.MAV_CMD_NAV_LAND: lambda _: self._pilot.set_mode(CopterMode.LAND),
+            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: self._pilot.set_mode(CopterMode.RTL),
+            mav.MAV_CMD_NAV_LOITER_UNLIM: lambda _: self._pilot.set_mode(CopterMode.LOITER),
             mav.MAV_CMD_DO_FLIGHTTERMINATION: self._terminate,
             mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
             mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
