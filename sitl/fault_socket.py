@@ -80,7 +80,7 @@ def handle(request: bytes, world: SitlWorld) -> dict[str, Any]:
         fault = validated(FaultParams, wanted, "fault")
     except ConfigError as error:
         return _refused(list(error.problems))
-    problems = list(world.can(fault))
+    problems = list(fault.problems(world.params.vehicles, world.params.first_vehicle))
     if problems:
         return _refused(problems)
     world.faults.begin(fault, world.since_boot_us)

@@ -74,3 +74,6 @@ class MavlinkInterface(Protocol):
 
     def send_due(self, now_us: int) -> None:
         """Send the messages that are due."""
+
+    def reboot(self, now_us: int) -> None:
+        """Restart the autopilot as after power-up; `now_us` is on the clock of the simulation."""

@@ -6,7 +6,7 @@ the same bytes give the same flight. Setpoints that have arrived by then act in 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -32,10 +32,9 @@ from sitl.px4.parameters import Parameters
 from sitl.vehicle_parts import Commander, MavlinkInterface
 from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.core.types import FlightMode, GeoOrigin
-from swarmctl.errors import ConfigError
 from swarmctl.mavlink.signing.signature import SigningKey
 from swarmctl.mavlink.transport import Transport
-from swarmctl.simulator_config import FaultParams, SimulatorConfig
+from swarmctl.simulator_config import SimulatorConfig
 
 AUTOPILOT_HZ = 50
 _SCALED_TIMEOUTS = ("COM_OF_LOSS_T", "COM_DL_LOSS_T", "COM_RC_LOSS_T")
@@ -49,14 +48,6 @@ class Metered(Protocol):
     battery_01: float
     battery_v: float
     battery_a: float
-
-
-@runtime_checkable
-class Rebooting(Protocol):
-    """A MAVLink interface whose autopilot can restart."""
-
-    def reboot(self, now_us: int) -> None:
-        """Restart as after power-up; `now_us` is on the clock of the simulation."""
 
 
 class SitlWorld:
@@ -106,9 +97,6 @@ class SitlWorld:
         self._boot_us: int | None = None
         self._now_us = 0
         self._steps = 0
-        problems = [problem for fault in params.faults for problem in self.can(fault)]
-        if problems:
-            raise ConfigError("sitl", problems)
         self.faults = Faults(self, params.faults, count, params.first_vehicle)
 
     def _make_plant(self, spawns_local_ned_m: Array) -> None:
@@ -194,15 +182,7 @@ class SitlWorld:
 
     def reboot(self, vehicle: int, now_us: int) -> None:
         """Restart an autopilot; its vehicle moves on by physics."""
-        interface = self.endpoints[vehicle]
-        if isinstance(interface, Rebooting):
-            interface.reboot(now_us)
-
-    def can(self, fault: FaultParams) -> Iterator[str]:
-        """Return every reason why a fault is not possible here."""
-        yield from fault.problems(self.params.vehicles)
-        if fault.kind == "reboot" and not isinstance(self.endpoints[0], Rebooting):
-            yield f"kind = reboot: {self.params.autopilot_kind} vehicles can't; choose another"
+        self.endpoints[vehicle].reboot(now_us)
 
     def truth_rows(self) -> NDArray[np.void]:
         """Return true states (N,) of `TRUTH_DTYPE`, shared frame."""

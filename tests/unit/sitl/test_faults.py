@@ -337,6 +337,18 @@ def test_a_running_simulator_takes_a_fault_and_answers(tmp_path: Path) -> None:
     assert not (tmp_path / "sitl.sock").exists()
 
 
+def test_vehicles_of_one_host_have_the_numbers_of_the_swarm_in_faults() -> None:
+    """On the control socket as in the configuration: two vehicles from number 2 on are 2 and 3."""
+    scheduled = {"kind": "motor", "vehicle": 3, "value": 0.5}
+    flown = FlownWorld(2, first_vehicle=2, sysid_base=3, faults=[scheduled])
+    flown.step(0.1)
+    request = {"kind": "motor", "vehicle": 2, "value": 0.25}
+    assert handle(json.dumps({"fault": request}).encode(), flown.world)["ok"]
+    assert flown.world.physics.rotor_health_01[0].tolist() == [0.25, 0.5]
+    refused = handle(json.dumps({"fault": {**request, "vehicle": 0}}).encode(), flown.world)
+    assert refused["problems"] == ["vehicle = 0: allowed: 2 to 3, or -1 for all"]
+
+
 @pytest.mark.parametrize(
     "request_", [b"", b"[]", b"{}", b"\xff", b'{"fault": 3}', b'{"fault": {"kind": "x"}}', b"[" * 5000]
 )
