@@ -272,16 +272,8 @@ class SitlWorld:
         return pilot, interfaces[0]
 
     def _publisher(self, vehicle: int, pilot: Autopilot) -> Callable[[], Report]:
-        plant, origin = self.plant, self.origins[vehicle]
-        rotor_scale = 1.0 / plant.preset.rotor_force_max_n
+        origin = self.origins[vehicle]
         cached: list[Report] = []  # of the newest step, for the other link
-
-        def rotor_01() -> Sequence[float]:
-            shares_01: list[float] = (plant.rotor_force_n[:, vehicle] * rotor_scale).tolist()
-            return shares_01
-
-        def force_frd_m_s2() -> Sequence[float]:
-            return self.imu.of(vehicle)
 
         def report() -> Report:
             now_us = self._now_us - (self._boot_us or 0)
@@ -292,8 +284,8 @@ class SitlWorld:
                 estimate=estimate,
                 autopilot=pilot,
                 origin=pilot.boot.origin or origin,
-                rotor_01=rotor_01,
-                force_frd_m_s2=force_frd_m_s2,
+                rotor_01=lambda: self.plant.rotor_01(vehicle),
+                force_frd_m_s2=lambda: self.imu.of(vehicle),
                 simulation_us=now_us,
             )
             cached[:] = [made]

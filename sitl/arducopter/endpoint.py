@@ -341,18 +341,13 @@ def arducopter_links(
     sysid: int, links: Sequence[Transport], pilot: ArduCopter, plant: Plant, vehicle: int, *, start: Start
 ) -> list[ArduCopterEndpoint]:
     """Return the MAVLink interface of an autopilot on each of its links."""
-    rotor_scale = 1.0 / plant.preset.rotor_force_max_n
-
-    def rotor_01() -> Sequence[float]:
-        shares_01: list[float] = (plant.rotor_force_n[:, vehicle] * rotor_scale).tolist()
-        return shares_01
 
     def report() -> CopterReport:
         return CopterReport(
             estimate=pilot.clock.local(start.estimate()),
             pilot=pilot,
             origin=pilot.clock.origin or start.origin,
-            rotor_01=rotor_01,
+            rotor_01=lambda: plant.rotor_01(vehicle),
         )
 
     step_us = round(plant.dt_s * 1e6)

@@ -218,6 +218,11 @@ class Plant:
         height_m: Array = (self.ground_z_m if self.ground_z_m is not None else 0.0) - self.state[12]
         return height_m
 
+    def rotor_01(self, vehicle: int) -> list[float]:
+        """Return the forces (4,) of a vehicle's rotors over their limit."""
+        forces_01: list[float] = (self.rotor_force_n[:, vehicle] * (1.0 / self.preset.rotor_force_max_n)).tolist()
+        return forces_01
+
     def set_wind(self, wind_ned_m_s: Array | None) -> None:
         """Set the air velocity (3, N) NED that drag acts against; None for still air. Constant over one step."""
         self._wind_ned_m_s = None if wind_ned_m_s is None else np.array(wind_ned_m_s, dtype=np.float64)
