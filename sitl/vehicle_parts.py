@@ -1,14 +1,41 @@
-"""Interfaces of a vehicle's autopilot and of its MAVLink side, as `SitlWorld` uses them for every dialect."""
+"""What every autopilot commands, and the interfaces of it and of its MAVLink side, as `SitlWorld` uses them."""
 
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from sitl.plant.sensors import Estimate
-from sitl.px4.navigator import Command
+from sitl.plant.vehicle import Array
 from swarmctl.core.types import FlightMode, Landed
 from swarmctl.mavlink.transport import Transport
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """Command to one vehicle's attitude loop: attitude or body rates, and collective thrust.
+
+    Attributes:
+        q_nb: (4,) wxyz, unit length.
+        thrust_01: share of full thrust.
+        rate_frd_rad_s: rates to fly instead of the attitude; NaN: that axis is uncontrolled.
+        feed_frd_rad_s: feed-forward added to the rates of the attitude loop.
+        stopped: motors do not turn though armed.
+        loose: no torque at all.
+    """
+
+    q_nb: Array
+    thrust_01: float
+    rate_frd_rad_s: tuple[float, float, float] | None = None
+    feed_frd_rad_s: tuple[float, float, float] | None = None
+    stopped: bool = False
+    loose: bool = False
+
+
+IDLE = Command(q_nb=np.array([1.0, 0.0, 0.0, 0.0]), thrust_01=0.0, loose=True)
 
 
 class ParameterTable(Protocol):

@@ -27,9 +27,9 @@ from sitl.px4.autopilot import Autopilot
 from sitl.px4.link.endpoint import Endpoint
 from sitl.px4.link.schedule import GCS_HZ
 from sitl.px4.link.streams import Report
-from sitl.px4.navigator import IDLE, Navigator
+from sitl.px4.navigator import Navigator
 from sitl.px4.parameters import Parameters
-from sitl.vehicle_parts import Commander, MavlinkInterface
+from sitl.vehicle_parts import IDLE, Commander, MavlinkInterface
 from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.core.types import FlightMode, GeoOrigin
 from swarmctl.mavlink.signing.signature import SigningKey

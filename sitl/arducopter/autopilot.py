@@ -33,11 +33,11 @@ from sitl.arducopter.modes import (
 from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
 from sitl.arducopter.return_home import ReturnHome, ReturnStage
+from sitl.boot import Boot
+from sitl.net.mavlink_values import Result, Severity
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.plant.vehicle import Array
-from sitl.px4.boot import Boot
-from sitl.px4.modes import Result, Severity
-from sitl.px4.navigator import IDLE, Command
+from sitl.vehicle_parts import IDLE, Command
 from swarmctl.core.frames import euler_from_quat, quat_from_euler
 from swarmctl.core.types import FlightMode, Landed
 

@@ -19,11 +19,11 @@ from sitl.arducopter.modes import CopterMode
 from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
 from sitl.arducopter.streams import ALL_GROUPS, STREAMS, CopterReport, Intervals
+from sitl.net.mavlink_values import Result, Severity
 from sitl.net.wire import KINDS, FrameWriter, Kind
+from sitl.parameter_values import UnknownParameterError, WireValue
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.plant.vehicle import Plant
-from sitl.px4.modes import Result, Severity
-from sitl.px4.parameters import UnknownParameterError, WireValue
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import Transport

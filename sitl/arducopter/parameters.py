@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from sitl.px4.parameters import UnknownParameterError, WireValue
+from sitl.parameter_values import UnknownParameterError, WireValue
 
 INT8, INT16, INT32, REAL32 = 2, 4, 6, 9  # MAV_PARAM_TYPE
 _RANGES = {INT8: 1 << 7, INT16: 1 << 15, INT32: 1 << 31}

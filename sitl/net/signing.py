@@ -15,7 +15,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mav
 
-from sitl.px4.modes import Severity
+from sitl.net.mavlink_values import Severity
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.signing.signature import (

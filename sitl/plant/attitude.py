@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 
 from sitl.plant.airframes import Preset
+from sitl.plant.rates import RateLoop
 from sitl.plant.vehicle import Array
-from sitl.px4.rates import RateLoop
 from swarmctl.core.frames import euler_from_quat
 
 _TURN_RAD = 2.0 * math.pi

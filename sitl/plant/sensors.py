@@ -36,6 +36,10 @@ class LocalOrigin:
         """Return latitude and longitude [1e-7 deg] of a local position; flat over the few km of a flight."""
         return self.lat_e7 + round(x_m / self.metres_per_e7_north), self.lon_e7 + round(y_m / self.metres_per_e7_east)
 
+    def to_xy_m(self, lat_e7: float, lon_e7: float) -> tuple[float, float]:
+        """Return the local position of a place [1e-7 deg], the inverse of `to_geo_e7`."""
+        return (lat_e7 - self.lat_e7) * self.metres_per_e7_north, (lon_e7 - self.lon_e7) * self.metres_per_e7_east
+
 
 def local_origin(spawn_ned_m: Array, shared: GeoOrigin) -> LocalOrigin:
     """Return the rounded local origin of a vehicle that spawns at `spawn_ned_m` (3,) in the shared frame."""

@@ -9,6 +9,7 @@ import enum
 import math
 from collections.abc import Callable
 
+from sitl.net.mavlink_values import Severity
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.px4.missions import (
     DO_CHANGE_SPEED,
@@ -21,11 +22,11 @@ from sitl.px4.missions import (
     NAV_TAKEOFF,
     Item,
     Store,
-    local_xy_m,
 )
-from sitl.px4.modes import Px4Mode, Severity
-from sitl.px4.navigator import IDLE, Command, Navigator
+from sitl.px4.modes import Px4Mode
+from sitl.px4.navigator import Navigator
 from sitl.px4.parameters import Parameters
+from sitl.vehicle_parts import IDLE, Command
 
 TAKEOFF_REACHED_M = 0.1
 HEIGHT_REACHED_M = 0.5
@@ -314,6 +315,6 @@ class AutoFlight:
         if self.origin is None or (item.lat_e7 == 0 and item.lon_e7 == 0):
             x_m, y_m = estimate.pos_ned_m[:2]
         else:
-            x_m, y_m = local_xy_m(self.origin, item.lat_e7, item.lon_e7)
+            x_m, y_m = self.origin.to_xy_m(item.lat_e7, item.lon_e7)
         height_m = item.z_m if math.isfinite(item.z_m) else 0.0
         return x_m, y_m, (home[2] - height_m if item.relative else self.origin_alt_m - height_m)

@@ -11,9 +11,10 @@ import math
 from collections import Counter, deque
 from collections.abc import Sequence
 
+from sitl.boot import Boot
+from sitl.net.mavlink_values import Result, Severity
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.px4.auto_flight import AutoFlight, Phase
-from sitl.px4.boot import Boot
 from sitl.px4.failsafe import Action, Cause, Watch
 from sitl.px4.geofence import Geofence
 from sitl.px4.landing import LandDetector
@@ -29,12 +30,11 @@ from sitl.px4.modes import (
     MavState,
     OffboardLoss,
     Px4Mode,
-    Result,
-    Severity,
     base_mode,
 )
-from sitl.px4.navigator import IDLE, Command, Navigator, Triple
+from sitl.px4.navigator import Navigator, Triple
 from sitl.px4.parameters import Parameters
+from sitl.vehicle_parts import IDLE, Command
 from swarmctl.core.types import FlightMode, Landed
 
 CHECK_US = 100_000  # period of PX4's failsafe checks

@@ -10,7 +10,7 @@ import enum
 import math
 from collections.abc import Callable, Sequence
 
-from sitl.px4.modes import Severity
+from sitl.net.mavlink_values import Severity
 from sitl.px4.parameters import Parameters
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from sitl.plant.sensors import LocalOrigin
-from sitl.px4.missions import CIRCLE_IN, CIRCLE_OUT, FENCE, FENCE_IN, FENCE_OUT, Store, local_xy_m
+from sitl.px4.missions import CIRCLE_IN, CIRCLE_OUT, FENCE, FENCE_IN, FENCE_OUT, Store
 from sitl.px4.parameters import Parameters
 
 Xy = tuple[float, float]
@@ -69,14 +69,12 @@ class Geofence:
         while i < len(items):
             item = items[i]
             if item.command in (CIRCLE_IN, CIRCLE_OUT):
-                centre = local_xy_m(origin, item.lat_e7, item.lon_e7)
+                centre = origin.to_xy_m(item.lat_e7, item.lon_e7)
                 self._circles.append((item.command == CIRCLE_IN, centre, item.params[0]))
                 i += 1
             elif item.command in (FENCE_IN, FENCE_OUT):
                 corners = items[i : i + int(item.params[0])]
-                self._areas.append(
-                    (item.command == FENCE_IN, [local_xy_m(origin, c.lat_e7, c.lon_e7) for c in corners])
-                )
+                self._areas.append((item.command == FENCE_IN, [origin.to_xy_m(c.lat_e7, c.lon_e7) for c in corners]))
                 i += len(corners)
             else:
                 i += 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sitl.px4.modes import Severity
+from sitl.net.mavlink_values import Severity
 from sitl.px4.parameters import Parameters
 from swarmctl.core.types import Landed
 

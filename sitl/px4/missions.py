@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import development as mav
 
-from sitl.plant.sensors import LocalOrigin
 from sitl.px4.modes import MissionState
 
 MISSION, FENCE, RALLY, ALL = 0, 1, 2, 255  # MAV_MISSION_TYPE
@@ -73,14 +72,6 @@ class Progress(NamedTuple):
     total: int
     state: int
     mode: int
-
-
-def local_xy_m(origin: LocalOrigin, lat_e7: float, lon_e7: float) -> tuple[float, float]:
-    """Return the local NED position of a place [1e-7 deg]; flat, the inverse of `LocalOrigin.to_geo_e7`."""
-    return (
-        (lat_e7 - origin.lat_e7) * origin.metres_per_e7_north,
-        (lon_e7 - origin.lon_e7) * origin.metres_per_e7_east,
-    )
 
 
 def validate(kind: int, item: Item) -> MissionResult:

@@ -1,4 +1,4 @@
-"""PX4's modes in MAVLink: custom_mode numbers, base_mode, MAV_STATE, and results. Tables only."""
+"""PX4's modes in MAVLink: custom_mode numbers, base_mode, MAV_STATE. Tables only."""
 
 from __future__ import annotations
 
@@ -92,26 +92,6 @@ class MavState(enum.IntEnum):
     ACTIVE = 4
     CRITICAL = 5
     TERMINATION = 8
-
-
-class Result(enum.IntEnum):
-    """Lists the values of MAV_RESULT that are sent."""
-
-    ACCEPTED = 0
-    TEMPORARILY_REJECTED = 1
-    DENIED = 2
-    UNSUPPORTED = 3
-    FAILED = 4
-
-
-class Severity(enum.IntEnum):
-    """Lists the values of MAV_SEVERITY that are sent."""
-
-    EMERGENCY = 0
-    CRITICAL = 2
-    ERROR = 3
-    WARNING = 4
-    INFO = 6
 
 
 class MissionState(enum.IntEnum):

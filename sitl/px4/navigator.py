@@ -7,13 +7,12 @@ thrust, as an autopilot's hover-thrust estimator does. Limits are parameters and
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from sitl.plant.sensors import Estimate
-from sitl.plant.vehicle import Array
 from sitl.px4.parameters import Parameters
+from sitl.vehicle_parts import Command
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
 
 VEL_P_1_S = 1.8  # MPC_XY_VEL_P_ACC
@@ -30,30 +29,6 @@ CLIMB_FAST_ABOVE_M, CLIMB_GAIN = 25.0, 0.6  # fitted: 2.5 m in 7.8 s after armin
 SLOW_BELOW_M, FAST_ABOVE_M = 5.0, 10.0  # MPC_LAND_ALT2, MPC_LAND_ALT1: between them vertical speed limits blend
 _NAN = math.nan
 Triple = tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
-    """Command to one vehicle's attitude loop: attitude or body rates, and collective thrust.
-
-    Attributes:
-        q_nb: (4,) wxyz, unit length.
-        thrust_01: share of full thrust.
-        rate_frd_rad_s: rates to fly instead of the attitude; NaN: that axis is uncontrolled.
-        feed_frd_rad_s: feed-forward added to the rates of the attitude loop.
-        stopped: motors do not turn though armed.
-        loose: no torque at all.
-    """
-
-    q_nb: Array
-    thrust_01: float
-    rate_frd_rad_s: Triple | None = None
-    feed_frd_rad_s: Triple | None = None
-    stopped: bool = False
-    loose: bool = False
-
-
-IDLE = Command(q_nb=np.array([1.0, 0.0, 0.0, 0.0]), thrust_01=0.0, loose=True)
 
 
 class Navigator:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from dataclasses import dataclass
+
+from sitl.parameter_values import UnknownParameterError, WireValue
 
 INT32 = 6  # MAV_PARAM_TYPE
 REAL32 = 9
@@ -79,20 +80,6 @@ DEFAULTS = {name: _default(text) for name, _, text in (entry.partition("=") for 
 HASH_NAME = "_HASH_CHECK"
 HASH_INDEX = 65535
 UINT32 = 5
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WireValue:
-    """A parameter as PARAM_VALUE carries it."""
-
-    name: str
-    value: float
-    kind: int
-    index: int
-
-
-class UnknownParameterError(KeyError):
-    """There is no parameter of that name."""
 
 
 class WrongTypeError(TypeError):

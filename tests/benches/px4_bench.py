@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import development as mav
 
+from sitl.net.mavlink_values import Result
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.link.endpoint import Endpoint
-from sitl.px4.modes import Px4Mode, Result
+from sitl.px4.modes import Px4Mode
 from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.mavlink.codec import Codec

@@ -8,9 +8,9 @@ from typing import Protocol
 
 from pymavlink.dialects.v20 import development as mav
 
+from sitl.net.mavlink_values import Result, Severity
 from sitl.px4.autopilot import Autopilot
-from sitl.px4.missions import local_xy_m
-from sitl.px4.modes import MODE_NAMES, Px4Mode, Result, Severity
+from sitl.px4.modes import MODE_NAMES, Px4Mode
 
 FORCE = 21196.0  # p2 of ARM/DISARM
 CUSTOM_MODE_FLAG = 1
@@ -141,7 +141,7 @@ class Commands:
             return Result.ACCEPTED
         x_m, y_m, z_m = here
         if math.isfinite(params[4]) and math.isfinite(params[5]) and abs(params[4]) <= 90 and abs(params[5]) <= 180:
-            x_m, y_m = local_xy_m(origin, params[4] * 1e7, params[5] * 1e7)
+            x_m, y_m = origin.to_xy_m(params[4] * 1e7, params[5] * 1e7)
         if math.isfinite(params[6]):
             z_m = origin.alt_mm / 1e3 - params[6]
         if math.isfinite(params[0]) and params[0] > 0:
@@ -162,7 +162,7 @@ class Commands:
         if params[0] == 1.0:
             pilot.home_ned_m = here
         elif all(math.isfinite(p) for p in params[4:]) and abs(params[4]) <= 90 and abs(params[5]) <= 180:
-            pilot.home_ned_m = *local_xy_m(origin, params[4] * 1e7, params[5] * 1e7), origin.alt_mm / 1e3 - params[6]
+            pilot.home_ned_m = *origin.to_xy_m(params[4] * 1e7, params[5] * 1e7), origin.alt_mm / 1e3 - params[6]
         else:
             return Result.DENIED
         return Result.ACCEPTED

@@ -13,6 +13,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mav
 
+from sitl.net.mavlink_values import Result, Severity
 from sitl.net.wire import KINDS, FrameWriter, Kind
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.link.commands import Commands, Params
@@ -21,7 +22,7 @@ from sitl.px4.link.parameters import ParameterLink
 from sitl.px4.link.schedule import OFFBOARD_HZ, Schedule
 from sitl.px4.link.streams import Fields, LinkCounts, Report
 from sitl.px4.link.streams_health import STREAMS
-from sitl.px4.modes import MODE_NAMES, STANDARD_MODES, Result, Severity
+from sitl.px4.modes import MODE_NAMES, STANDARD_MODES
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import Transport

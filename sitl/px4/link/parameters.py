@@ -8,7 +8,8 @@ from typing import Any, Protocol
 from pymavlink.dialects.v20 import development as mav
 
 from sitl.net.wire import KINDS
-from sitl.px4.parameters import HASH_NAME, Parameters, UnknownParameterError, WireValue, WrongTypeError
+from sitl.parameter_values import UnknownParameterError, WireValue
+from sitl.px4.parameters import HASH_NAME, Parameters, WrongTypeError
 
 UNKNOWN, WRONG_TYPE = 1, 7  # MAV_PARAM_ERROR
 STALE_INDEX = 511  # PX4 leaves the index of a PARAM_ERROR by name unset; this value then appears

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sitl.px4.navigator import IDLE, Command
+from sitl.vehicle_parts import IDLE, Command
 
 NO_ROLL_RATE, NO_PITCH_RATE, NO_YAW_RATE = 1, 2, 4
 THRUST_BODY, NO_THRUST, NO_ATTITUDE = 32, 64, 128

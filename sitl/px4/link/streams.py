@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import development as mav
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.modes import STANDARD_MODES, Px4Mode
-from sitl.px4.navigator import IDLE
+from sitl.vehicle_parts import IDLE
 
 FRAME_LOCAL_NED = 1
 PROTOCOL_VERSION = 300

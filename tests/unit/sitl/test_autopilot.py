@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sitl.px4.modes import OffboardLoss, Px4Mode, Result
+from sitl.net.mavlink_values import Result
+from sitl.px4.modes import OffboardLoss, Px4Mode
 from swarmctl.core.frames import quat_from_euler
 from swarmctl.core.types import Landed
 from tests.benches.px4_bench import COARSE, HOVER, LEVEL, NAN, Bench, taken_off

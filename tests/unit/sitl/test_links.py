@@ -11,9 +11,10 @@ import pytest
 from pymavlink.dialects.v20 import development as mav
 
 from sitl.fault_socket import ControlSocket
+from sitl.net.mavlink_values import Result
 from sitl.net.ports import OpenPort
 from sitl.net.tcp import serve_tcp
-from sitl.px4.modes import Px4Mode, Result
+from sitl.px4.modes import Px4Mode
 from sitl.px4.parameters import REAL32
 from swarmctl.mavlink.transport import bind_udp
 from tests.benches.free_ports import free_ports

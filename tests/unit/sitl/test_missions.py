@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
-from sitl.px4.modes import MavState, MissionState, Px4Mode, Result
+from sitl.net.mavlink_values import Result
+from sitl.px4.modes import MavState, MissionState, Px4Mode
 from swarmctl.core.types import Landed
 from tests.benches.px4_bench import COARSE, NAN, Bench, taken_off
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from sitl.plant.sensors import Estimate, LocalOrigin
-from sitl.px4.missions import local_xy_m
 
 BOOT_US = 1_300_000  # from power to the first HEARTBEAT, when the estimator takes its 4 s
 _BOOT_SHARE = 0.325  # share of the estimator's time, when that is shorter
@@ -40,7 +39,7 @@ class Boot:
         x_m, y_m, z_m = where.pos_ned_m
         lat_e7, lon_e7 = origin.to_geo_e7(x_m, y_m)
         alt_mm = origin.alt_mm - round(z_m * 1e3)
-        dx_m, dy_m = local_xy_m(origin, lat_e7, lon_e7)
+        dx_m, dy_m = origin.to_xy_m(lat_e7, lon_e7)
         old = self._shift_ned_m
         self._shift_ned_m = old[0] + dx_m, old[1] + dy_m, old[2] + (origin.alt_mm - alt_mm) / 1e3
         self.origin = replace(origin, lat_e7=lat_e7, lon_e7=lon_e7, alt_mm=alt_mm)
