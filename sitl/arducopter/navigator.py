@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
+from sitl.acceleration import attitude_for, limited
 from sitl.arducopter.parameters import CopterParameters
 from sitl.plant.sensors import Estimate
 from sitl.plant.vehicle import Array
-from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
+from swarmctl.core.frames import GRAVITY_M_S2
 
 LEASH_M = 1.0  # limit of the shaped height's lead over the vehicle
 Z_I_1_S2 = 2.0  # in place of PSC_ACCZ_I
@@ -121,17 +120,9 @@ class CopterNavigator:
                 self._integral_m_s2[axis] = max(-XY_I_MAX_M_S2, min(XY_I_MAX_M_S2, summed))
         tilt_m_s2 = GRAVITY_M_S2 * math.tan(math.radians(0.01 * self._parameters.real("ANGLE_MAX")))
         limit = min(self._parameters.metres("WPNAV_ACCEL"), tilt_m_s2)
-        acc = _limited(gain * error[0] + self._integral_m_s2[0], gain * error[1] + self._integral_m_s2[1], limit)
+        acc = limited(gain * error[0] + self._integral_m_s2[0], gain * error[1] + self._integral_m_s2[1], limit)
         if estimate.on_ground:
             acc = 0.0, 0.0
-        change = _limited(acc[0] - self._acc_m_s2[0], acc[1] - self._acc_m_s2[1], JERK_MAX_M_S3 * dt_s)
+        change = limited(acc[0] - self._acc_m_s2[0], acc[1] - self._acc_m_s2[1], JERK_MAX_M_S3 * dt_s)
         self._acc_m_s2 = [self._acc_m_s2[0] + change[0], self._acc_m_s2[1] + change[1]]
-        down = np.array([-self._acc_m_s2[0], -self._acc_m_s2[1], GRAVITY_M_S2])
-        return quat_from_body_z(down / math.sqrt(float(down @ down)), self._yaw_rad)
-
-
-def _limited(north: float, east: float, limit: float) -> tuple[float, float]:
-    size = math.hypot(north, east)
-    if size <= limit:
-        return north, east
-    return north * limit / size, east * limit / size
+        return attitude_for((self._acc_m_s2[0], self._acc_m_s2[1], 0.0), self._yaw_rad)

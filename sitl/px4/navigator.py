@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
+from sitl.acceleration import attitude_for, limited
 from sitl.plant.sensors import Estimate
 from sitl.px4.parameters import Parameters
 from sitl.vehicle_parts import Command
-from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
+from swarmctl.core.frames import GRAVITY_M_S2
 
 VEL_P_1_S = 1.8  # MPC_XY_VEL_P_ACC
 VEL_I_1_S2 = 0.4
@@ -128,7 +127,7 @@ class Navigator:
         gain = self._parameters.real("MPC_XY_P")
         north, east = gain * (self._hold_xy_m[0] - x_m), gain * (self._hold_xy_m[1] - y_m)
         cruise = self._parameters.real("MPC_XY_CRUISE") if self.speed_m_s is None else self.speed_m_s
-        return _limited(north, east, max(0.0, min(cruise, self._parameters.real("MPC_XY_VEL_MAX"))))
+        return limited(north, east, max(0.0, min(cruise, self._parameters.real("MPC_XY_VEL_MAX"))))
 
     def _fly(self, estimate: Estimate, speed_z_m_s: float, dt_s: float) -> Command:
         wanted = *self._speed_xy(estimate), speed_z_m_s
@@ -137,7 +136,7 @@ class Navigator:
         for axis in (0, 1):
             error = wanted[axis] - estimate.vel_ned_m_s[axis]
             acc.append(VEL_P_1_S * error + self._summed(estimate, axis, VEL_I_1_S2, 2.0, error=error, dt_s=dt_s))
-        acc_n, acc_e = _limited(acc[0], acc[1], ACC_MAX_M_S2)
+        acc_n, acc_e = limited(acc[0], acc[1], ACC_MAX_M_S2)
         return self._aim(estimate, acc_n, acc_e, self._acc_down(estimate, speed_z_m_s, dt_s), dt_s=dt_s)
 
     def _acc_down(self, estimate: Estimate, speed_z_m_s: float, dt_s: float) -> float:
@@ -157,26 +156,16 @@ class Navigator:
         if estimate.on_ground:
             acc_n = acc_e = 0.0
         step = JERK_MAX_M_S3 * dt_s
-        d_n, d_e = _limited(acc_n - self._acc_m_s2[0], acc_e - self._acc_m_s2[1], step)
+        d_n, d_e = limited(acc_n - self._acc_m_s2[0], acc_e - self._acc_m_s2[1], step)
         tilt_rad = math.radians(max(1.0, min(85.0, self._parameters.real("MPC_TILTMAX_AIR"))))
         level = (GRAVITY_M_S2 - acc_d) * math.tan(tilt_rad)  # horizontal acceleration at this tilt
-        self._acc_m_s2 = list(_limited(self._acc_m_s2[0] + d_n, self._acc_m_s2[1] + d_e, level))
-        down = np.array([-self._acc_m_s2[0], -self._acc_m_s2[1], GRAVITY_M_S2 - acc_d])
-        down /= math.sqrt(float(down @ down))
+        self._acc_m_s2 = list(limited(self._acc_m_s2[0] + d_n, self._acc_m_s2[1] + d_e, level))
         cos_tilt = max(0.5, estimate.down_axis_ned[2])
         thrust = self.hover_01 * (1.0 - acc_d / GRAVITY_M_S2) / cos_tilt
         ceiling = self._parameters.real("MPC_THR_MAX")
         floor = min(self._parameters.real("MPC_THR_MIN"), ceiling) if not estimate.on_ground else THRUST_MIN_01
-        return Command(
-            q_nb=quat_from_body_z(down, self._yaw_rad), thrust_01=max(0.0, min(1.0, ceiling, max(floor, thrust)))
-        )
-
-
-def _limited(north: float, east: float, limit: float) -> tuple[float, float]:
-    size = math.hypot(north, east)
-    if size <= limit:
-        return north, east
-    return north * limit / size, east * limit / size
+        q_nb = attitude_for((self._acc_m_s2[0], self._acc_m_s2[1], acc_d), self._yaw_rad)
+        return Command(q_nb=q_nb, thrust_01=max(0.0, min(1.0, ceiling, max(floor, thrust))))
 
 
 def _blend(height_m: float, slow: float, fast: float, fast_above_m: float = FAST_ABOVE_M) -> float:
