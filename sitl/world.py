@@ -265,7 +265,7 @@ class SitlWorld:
         sysid = params.sysid_base + vehicle
         pilot = arducopter_pilot(sysid, self.plant, start)
         signing = VehicleSigning(
-            rules=ARDUCOPTER_RULES, armed=lambda: pilot.armed, boot_us=lambda: pilot.clock.at_us, tell=pilot.send_text
+            rules=ARDUCOPTER_RULES, armed=lambda: pilot.armed, boot_us=lambda: pilot.boot.at_us, tell=pilot.send_text
         )
         interfaces = arducopter_links(sysid, self._signed(vehicle, signing), pilot, self.plant, vehicle, start=start)
         self.gcs_endpoints.extend(interfaces[1:])

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
+from sitl.arducopter.boot_times import BootTimes, arming_refusals
 from sitl.arducopter.guided import LEVEL, SOME_RATES, Guided, Setpoints, Target
 from sitl.arducopter.land_detector import LandDetector
 from sitl.arducopter.modes import (
@@ -25,10 +26,8 @@ from sitl.arducopter.modes import (
     NO_ARMING_IN,
     NOT_FLOWN_HERE,
     WITHOUT_POSITION_CONTROL,
-    BootTimes,
     CopterMode,
     CopterState,
-    arming_refusals,
 )
 from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
@@ -49,8 +48,8 @@ class ArduCopter:
     """The commander of one vehicle.
 
     Attributes:
-        clock: its own time and local frame.
-        boot: times at which its parts start to work, on that clock.
+        boot: its own time and local frame.
+        boot_times: when its parts start to work, since its boot.
         armed: motors may turn.
         mode: mode that flies.
         guided: what GUIDED does.
@@ -74,9 +73,9 @@ class ArduCopter:
         airborne: bool,
     ) -> None:
         self.parameters = parameters
-        self.clock = Boot()
-        self.clock.origin = origin
-        self.boot = BootTimes.armable_after(ekf_ready_us)
+        self.boot = Boot()
+        self.boot.origin = origin
+        self.boot_times = BootTimes.armable_after(ekf_ready_us)
         self.released = not airborne
         self.refused: Counter[str] = Counter()
         self._outboxes: list[deque[tuple[Severity, str]]] = []
@@ -114,7 +113,7 @@ class ArduCopter:
 
     def reboot(self, now_us: int) -> None:
         """Restart at `now_us` of the simulation; parameters are kept, the local frame begins at the vehicle's place."""
-        self.clock.again(now_us, self._estimate)
+        self.boot.again(now_us, self._estimate)
         self._power_up()
 
     # --- what others ask ---
@@ -127,7 +126,7 @@ class ArduCopter:
 
     def prearm_passed(self, now_us: int) -> bool:
         """Whether the PREARM_CHECK of SYS_STATUS passes, independent of the mode."""
-        return self.armed or now_us >= self.boot.armable_us
+        return self.armed or now_us >= self.boot_times.armable_us
 
     @property
     def landed(self) -> Landed:
@@ -199,8 +198,8 @@ class ArduCopter:
         """Execute MAV_CMD_COMPONENT_ARM_DISARM p1=1."""
         if self.armed:
             return Result.ACCEPTED
-        reasons = arming_refusals(self.boot, now_us)
-        if force and now_us >= self.boot.initialised_us:
+        reasons = arming_refusals(self.boot_times, now_us)
+        if force and now_us >= self.boot_times.initialised_us:
             reasons = ()
         if self.mode in NO_ARMING_IN:
             reasons = (*reasons, f"Arm: {self.mode.name} mode not armable")
@@ -294,10 +293,10 @@ class ArduCopter:
 
         `estimate` and `now_us` are the simulation's; everywhere else time is since boot.
         """
-        now_us = self.clock.since_us(now_us)
+        now_us = self.boot.since_us(now_us)
         if now_us < 0:
             return
-        estimate = self.clock.local(estimate)
+        estimate = self.boot.local(estimate)
         self._estimate, self._now_us = estimate, now_us
         self._boot_on(estimate, now_us)
         self._land_detector.watch(estimate, self.throttle_in_01, self.armed, now_us)
@@ -314,10 +313,10 @@ class ArduCopter:
         self._put_out(*self._fliers[self.mode](estimate, dt_s))
 
     def _boot_on(self, estimate: Estimate, now_us: int) -> None:
-        if not self._initialised and now_us >= self.boot.initialised_us:
+        if not self._initialised and now_us >= self.boot_times.initialised_us:
             self._initialised = True
             self._enter(CopterMode.STABILIZE)
-        if not self.has_origin and now_us >= self.boot.origin_us:
+        if not self.has_origin and now_us >= self.boot_times.origin_us:
             self.has_origin = True
             self.send_text(Severity.INFO, "EKF3 IMU0 origin set")
             self._set_home(estimate)

@@ -111,11 +111,11 @@ class ArduCopterEndpoint:
         self._texts.clear()
         self._text_id = 0
         self._params: deque[int] = deque()
-        self._beat_us = self._timesync_us = self._pilot.boot.heartbeat_us
+        self._beat_us = self._timesync_us = self._pilot.boot_times.heartbeat_us
         self._told_mode, self._told_home = int(self._pilot.mode), self._pilot.home_set
         self._now_us = 0
         self._reboot_us: int | None = None
-        self._clock_us = self._pilot.clock.at_us
+        self._boot_us = self._pilot.boot.at_us
 
     def reboot(self, now_us: int) -> None:
         """Restart as after power-up, with every link of the vehicle; `now_us` is on the clock of the simulation."""
@@ -123,14 +123,14 @@ class ArduCopterEndpoint:
 
     def _at(self, now_us: int) -> int:
         """Return the time since the autopilot's boot; after a recent boot the link's state is discarded."""
-        if self._clock_us != self._pilot.clock.at_us:
+        if self._boot_us != self._pilot.boot.at_us:
             self._power_up()
-        self._now_us = self._pilot.clock.since_us(now_us)
+        self._now_us = self._pilot.boot.since_us(now_us)
         return self._now_us
 
     @property
     def _up(self) -> bool:
-        return self._now_us >= self._pilot.boot.heartbeat_us
+        return self._now_us >= self._pilot.boot_times.heartbeat_us
 
     def receive(self, now_us: int, transport_now_us: int) -> None:
         """Handle everything that has arrived; `now_us` is the simulation's time, everywhere else it is since boot."""
@@ -270,7 +270,7 @@ class ArduCopterEndpoint:
     def _request_reboot(self, params: Params) -> Result:
         if params[0] != 1.0 or self._pilot.armed:
             return Result.FAILED
-        self._reboot_us = self._now_us + self._pilot.clock.at_us + REBOOT_AFTER_US
+        self._reboot_us = self._now_us + self._pilot.boot.at_us + REBOOT_AFTER_US
         return Result.ACCEPTED
 
     def _get_home(self, _: Params) -> Result:
@@ -344,9 +344,9 @@ def arducopter_links(
 
     def report() -> CopterReport:
         return CopterReport(
-            estimate=pilot.clock.local(start.estimate()),
+            estimate=pilot.boot.local(start.estimate()),
             pilot=pilot,
-            origin=pilot.clock.origin or start.origin,
+            origin=pilot.boot.origin or start.origin,
             rotor_01=lambda: plant.rotor_01(vehicle),
         )
 

@@ -1,9 +1,8 @@
-"""ArduCopter's modes and boot in MAVLink: custom_mode numbers, MAV_STATE, refusals. Tables only."""
+"""ArduCopter's modes in MAVLink: custom_mode numbers, base_mode, MAV_STATE. Tables only."""
 
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
 
 from swarmctl.core.types import FlightMode
 
@@ -68,39 +67,3 @@ class CopterState(enum.IntEnum):
     STANDBY = 3
     ACTIVE = 4
     CRITICAL = 5
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BootTimes:
-    """Times of the boot steps after start [us]; in the measured order and proportions, with wiped parameters."""
-
-    heartbeat_us: int
-    initialised_us: int  # the mode is STABILIZE again
-    origin_us: int
-    armable_us: int
-
-    @classmethod
-    def armable_after(cls, armable_us: int) -> BootTimes:
-        """Return the measured boot (1.05, 2.45, 20.0, 23.7 s), scaled to be armable at `armable_us`."""
-        heartbeat_us, initialised_us, origin_us = (round(armable_us * at_s / 23.7) for at_s in (1.05, 2.45, 20.0))
-        return cls(heartbeat_us=heartbeat_us, initialised_us=initialised_us, origin_us=origin_us, armable_us=armable_us)
-
-
-_CONSISTENT_AFTER = 0.5  # share of the boot time: only the order of these texts was measured
-_NOT_READY = (
-    "Arm: Accels inconsistent",
-    "Arm: Gyros inconsistent",
-)
-
-
-def arming_refusals(boot: BootTimes, now_us: int) -> tuple[str, ...]:
-    """Return why arming is refused at this time after start; empty once it is not."""
-    if now_us < boot.initialised_us:
-        return ("Arm: System not initialised",)
-    if now_us < boot.armable_us * _CONSISTENT_AFTER:
-        return (*_NOT_READY, "Arm: EKF attitude is bad")
-    if now_us < boot.origin_us:
-        return ("Arm: EKF attitude is bad",)
-    if now_us < boot.armable_us:
-        return ("Arm: AHRS: not using configured AHRS type",)
-    return ()

@@ -141,7 +141,7 @@ class Bench:
 
     def booted(self) -> Bench:
         """Run until it can be armed."""
-        self.run(1e-6 * self.pilot.boot.armable_us + 0.02)
+        self.run(1e-6 * self.pilot.boot_times.armable_us + 0.02)
         return self
 
     def airborne(self, height_m: float = 5.0) -> Bench:

@@ -489,7 +489,7 @@ def test_boot_timeline() -> None:
 
 def test_boot_is_scaled_by_when_it_can_be_armed() -> None:
     bench = Bench(ekf_ready_s=1.0)
-    boot = bench.pilot.boot
+    boot = bench.pilot.boot_times
     assert (boot.armable_us, boot.heartbeat_us) == (1_000_000, 44_304)
     bench.run(0.98)
     assert bench.arm() == FAILED
