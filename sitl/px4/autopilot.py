@@ -15,7 +15,8 @@ from sitl.boot import Boot
 from sitl.net.mavlink_values import Result, Severity
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.px4.auto_flight import AutoFlight, Phase
-from sitl.px4.failsafe import Action, Cause, Watch
+from sitl.px4.failsafe import Watch
+from sitl.px4.failsafe_actions import FailsafeActions
 from sitl.px4.geofence import Geofence
 from sitl.px4.landing import LandDetector
 from sitl.px4.link.setpoints import OffboardStream
@@ -28,7 +29,6 @@ from sitl.px4.modes import (
     NO_ARMING_IN,
     NOT_KEPT_AFTER_LANDING,
     MavState,
-    OffboardLoss,
     Px4Mode,
     base_mode,
 )
@@ -38,15 +38,12 @@ from sitl.vehicle_parts import IDLE, Command
 from swarmctl.core.types import FlightMode, Landed
 
 CHECK_US = 100_000  # period of PX4's failsafe checks
-RESUME_US = 20_000  # from a resumed stream to OFFBOARD, before the next tick
 DEAD_RECKONING_US = 5_000_000  # EKF2_NOAID_TOUT: how long a position without GPS is valid
 REBOOT_AFTER_US = 400_000  # the acknowledgement is sent first
 REFUSED_EVERY_US = 1_000_000  # shortest interval between explanations of refused modes
 STATUS_EVERY_US = 500_000  # also sent at every change
 EPOCH_UTC_US = 1_767_225_600_000_000  # 2026-01-01, for flights without a wall clock
 _HEALTH_TEXT = "Arming denied: Resolve system health failures first\t"
-_LOSS_MODES = {OffboardLoss.LAND: Px4Mode.AUTO_LAND, OffboardLoss.HOLD: Px4Mode.AUTO_LOITER}
-_ACTION_MODES = {Action.HOLD: Px4Mode.AUTO_LOITER, Action.RETURN: Px4Mode.AUTO_RTL, Action.LAND: Px4Mode.AUTO_LAND}
 
 
 class Autopilot:
@@ -56,7 +53,6 @@ class Autopilot:
         armed: motors may turn.
         mode: mode that flies now.
         intended: commanded mode; differs from `mode` only in a failsafe.
-        failsafe: the autopilot acts on its own.
         terminated: motors off until reboot.
         home_ned_m: local position of the last arming.
         output: command to fly.
@@ -91,13 +87,15 @@ class Autopilot:
         self.battery_01, self.battery_v, self.battery_a = 1.0, 16.2, -1.0
         self.boot_utc_us = EPOCH_UTC_US
         self._fence = Geofence(parameters, self.store)
+        self._failsafe = FailsafeActions(self)
         self._navigator = navigator
         self._ekf_ready_us = ekf_ready_us
         self._begin()
 
     def _begin(self) -> None:
         """Restart; parameters and uploads stay."""
-        self.armed = self.failsafe = self.terminated = False
+        self.armed = self.terminated = False
+        self._failsafe.clear()
         self.mode = self.intended = self._resting_mode = Px4Mode.AUTO_LOITER
         self._land_detector.reset()
         self.home_ned_m: tuple[float, float, float] | None = None
@@ -108,11 +106,8 @@ class Autopilot:
         self.flight.reset()
         self.watch.reset()
         self._estimate: Estimate | None = None
-        self._cause: Cause | None = None
         self._refused_us = -REFUSED_EVERY_US
         self._armed_us = self._next_check_us = self._aided_us = self.unaided_us = 0
-        self._resume_us: int | None = None
-        self._delayed: tuple[int, Action] | None = None  # time and action after a delay in Hold
 
     def reboot(self, now_us: int) -> None:
         """Restart now; `now_us` is on the clock of the simulation."""
@@ -173,6 +168,11 @@ class Autopilot:
         return FLIGHT_MODES.get(self.mode, FlightMode.MANUAL)
 
     @property
+    def failsafe(self) -> bool:
+        """Whether the autopilot acts on its own."""
+        return self._failsafe.active
+
+    @property
     def has_position(self) -> bool:
         """Whether there is a horizontal position, measured or dead-reckoned for a short while."""
         return self.position_ok and self.unaided_us <= DEAD_RECKONING_US
@@ -212,8 +212,8 @@ class Autopilot:
             return False
         if flying and self.armed and not self.terminated:
             self.released, self.output = True, self.stream.command
-        elif self.failsafe and self._cause == Cause.OFFBOARD and self._resume_us is None:
-            self._resume_us = now_us
+        else:
+            self._failsafe.on_setpoint(now_us)
         return True
 
     # --- commands ---
@@ -231,7 +231,7 @@ class Autopilot:
             return Result.TEMPORARILY_REJECTED
         self.armed, self._armed_us = True, now_us
         self._land_detector.arm(now_us)
-        self._clear_failsafe()
+        self._failsafe.clear()
         self.mode = self.intended
         if self._estimate is not None:
             if self.has_position:
@@ -251,12 +251,13 @@ class Autopilot:
         if self.landed != Landed.ON_GROUND and self.released and not force:
             self.send_text(Severity.CRITICAL, "Disarming denied: not landed\t")
             return Result.TEMPORARILY_REJECTED
-        self._disarm("Disarmed by external command\t")
+        self.switch_off("Disarmed by external command\t")
         return Result.ACCEPTED
 
-    def _disarm(self, text: str, *, keep_mode: bool = False) -> None:
+    def switch_off(self, text: str, *, keep_mode: bool = False) -> None:
+        """Disarm, and say why."""
         self.armed = False
-        self._clear_failsafe()
+        self._failsafe.clear()
         self.watch.forget()
         self.output = self.stream.command = IDLE
         if not keep_mode:
@@ -284,8 +285,8 @@ class Autopilot:
             self.flight.takeoff_alt_amsl_m = takeoff_alt_amsl_m
         if mode == Px4Mode.AUTO_LAND and self.armed:
             self.send_text(Severity.INFO, "Landing at current position\t")
-        self._clear_failsafe()
-        self._enter(mode)
+        self._failsafe.clear()
+        self.enter(mode)
         return Result.ACCEPTED
 
     def _can_enter(self, mode: Px4Mode, now_us: int) -> bool:
@@ -300,10 +301,11 @@ class Autopilot:
         if not self.armed:
             return Result.DENIED
         self.mode = Px4Mode.TERMINATION
-        self._stop_for_good()
+        self.stop_for_good()
         return Result.ACCEPTED
 
-    def _stop_for_good(self) -> None:
+    def stop_for_good(self) -> None:
+        """Stop the motors until a reboot."""
         self.terminated = True
         self.output = IDLE
 
@@ -319,7 +321,8 @@ class Autopilot:
         if self.armed and self.mode == Px4Mode.AUTO_LOITER and self.landed != Landed.ON_GROUND:
             self.flight.reposition(goal_ned_m, yaw_rad)
 
-    def _enter(self, mode: Px4Mode) -> None:
+    def enter(self, mode: Px4Mode) -> None:
+        """Fly a mode, whoever wants it."""
         fresh = self.mode == Px4Mode.OFFBOARD
         self.mode = mode
         self.stream.command = IDLE  # OFFBOARD waits for the next setpoint; until then the last output stays
@@ -347,11 +350,10 @@ class Autopilot:
             self._check(estimate, now_us)
         if not self.armed or self.terminated:
             return
-        if self._resume_us is not None and now_us - self._resume_us >= RESUME_US:
-            self._resume(now_us)
+        self._failsafe.resume_when_due(now_us)
         text = self._land_detector.disarm_text(now_us)
         if text:
-            self._disarm(text)
+            self.switch_off(text)
         if self.armed and self.mode != Px4Mode.OFFBOARD:
             self.output = self.stream.spoiled(self._fly_auto(estimate, now_us, dt_s))
 
@@ -367,79 +369,13 @@ class Autopilot:
                 self.set_mode(Px4Mode.AUTO_RTL, now_us)
         return command
 
-    # --- failsafes ---
-
     def _check(self, estimate: Estimate, now_us: int) -> None:
         """Run the checks that PX4 does ten times a second."""
         origin = self.flight.origin
         breaches = self._fence.breaches(estimate.pos_ned_m, self.home_ned_m, origin) if origin else []
         cause, action = self.watch.check(breaches, self.battery_01, now_us, armed=self.armed)
-        if not self.armed or self.terminated:
-            return
-        if self.mode == Px4Mode.OFFBOARD and not self.stream_alive(now_us):
-            self._lose_stream()
-        elif not self.has_position and self.mode not in FLIES_BLIND:
-            self._fail(Cause.POSITION, Px4Mode.AUTO_LAND)
-        elif self.has_position and self._cause == Cause.POSITION:
-            self._clear_failsafe()
-            self._enter(self.intended)
-        if action > Action.WARN:
-            self._act(cause, action, now_us)
-        elif self._delayed is not None and now_us >= self._delayed[0] and self._cause is not None:
-            self._do(self._cause, self._delayed[1])
-
-    def _lose_stream(self) -> None:
-        action = self.parameters.integer("COM_OBL_RC_ACT")
-        self._cause = Cause.OFFBOARD
-        if action == OffboardLoss.TERMINATE:
-            self._do(Cause.OFFBOARD, Action.TERMINATE)
-        elif action == OffboardLoss.DISARM:
-            self._do(Cause.OFFBOARD, Action.DISARM)
-        else:
-            known = OffboardLoss(action) if 0 <= action <= OffboardLoss.DISARM else OffboardLoss.RETURN
-            self._fail(Cause.OFFBOARD, _LOSS_MODES.get(known, Px4Mode.AUTO_RTL))
-
-    def _act(self, cause: Cause, action: Action, now_us: int) -> None:
-        """Carry out a failsafe's action; Return and Land first wait in Hold for a pilot."""
-        wait_s = self.parameters.real("COM_FAIL_ACT_T")
-        if action in (Action.RETURN, Action.LAND) and wait_s > 0:
-            self._fail(cause, Px4Mode.AUTO_LOITER)
-            self._delayed = now_us + round(wait_s * 1e6), action
-        else:
-            self._do(cause, action)
-
-    def _do(self, cause: Cause, action: Action) -> None:
-        self._delayed = None
-        if action in _ACTION_MODES:
-            self._fail(cause, _ACTION_MODES[action])
-            return
-        self.send_text(Severity.CRITICAL, "Failsafe activated\t")
-        if action == Action.TERMINATE:
-            self.failsafe = True
-            self._stop_for_good()
-        else:
-            self._disarm("Disarmed by failsafe\t", keep_mode=True)
-
-    def _fail(self, cause: Cause, mode: Px4Mode) -> None:
-        """Fly `mode` until a mode is commanded, or until the cause has ended where PX4 then returns by itself."""
-        self._delayed = self._resume_us = None
-        if not self.failsafe or cause != self._cause:
-            self.send_text(Severity.CRITICAL, "Failsafe activated\t")
-        self.failsafe, self._cause = True, cause
-        mode = mode if self.has_position or mode in FLIES_BLIND else Px4Mode.AUTO_LAND
-        if mode != self.mode:
-            self._enter(mode)
-
-    def _clear_failsafe(self) -> None:
-        self.failsafe = False
-        self._cause = self._delayed = self._resume_us = None
-
-    def _resume(self, now_us: int) -> None:
-        """Resume OFFBOARD after a loss of the stream, unless it is lost again."""
-        self._resume_us = None
-        if self.stream_alive(now_us) and self.intended == Px4Mode.OFFBOARD:
-            self._clear_failsafe()
-            self._enter(Px4Mode.OFFBOARD)
+        if self.armed and not self.terminated:
+            self._failsafe.check(cause, action, now_us)
 
     def _airborne_state(self) -> Landed:
         if not self.armed or self.mode == Px4Mode.OFFBOARD:

@@ -1,7 +1,8 @@
 """Failsafes of PX4 besides a lost setpoint stream: geofence, battery, ground-station link.
 
-This module monitors and requests actions; the `Autopilot` executes them. A Return or Land waits COM_FAIL_ACT_T seconds
-in Hold, so that a pilot can take over. A commanded mode ends a failsafe, and its cause acts again only after it ended.
+This module monitors and requests actions; `failsafe_actions` executes them. A Return or Land waits COM_FAIL_ACT_T
+seconds in Hold, so that a pilot can take over. A commanded mode ends a failsafe, and its cause acts again only after it
+ended.
 """
 
 from __future__ import annotations
