@@ -14,7 +14,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
 from sitl.arducopter.boot_times import BootTimes, arming_refusals
-from sitl.arducopter.guided import LEVEL, SOME_RATES, Guided, Setpoints, Target
+from sitl.arducopter.guided import LEVEL, SOME_RATES, Guided, GuidedFlight, levelled
 from sitl.arducopter.land_detector import LandDetector
 from sitl.arducopter.modes import (
     BASE_ALWAYS,
@@ -37,11 +37,9 @@ from sitl.net.mavlink_values import Result, Severity
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.plant.vehicle import Array
 from sitl.vehicle_parts import IDLE, Command
-from swarmctl.core.frames import euler_from_quat, quat_from_euler
 from swarmctl.core.types import FlightMode, Landed
 
 FORCE_ARM, FORCE_DISARM = 2989.0, 21196.0  # p2 of ARM/DISARM
-REACHED_M = 0.1
 
 
 class ArduCopter:
@@ -52,7 +50,7 @@ class ArduCopter:
         boot_times: when its parts start to work, since its boot.
         armed: motors may turn.
         mode: mode that flies.
-        guided: what GUIDED does.
+        guided: its GUIDED mode.
         home_ned_m: local position of the last arming, or of the EKF origin before.
         home_set: number of times home has been set.
         output: attitude and thrust to fly.
@@ -95,16 +93,13 @@ class ArduCopter:
     def _power_up(self) -> None:
         self.armed = False
         self.mode = CopterMode.STABILIZE
-        self.guided = Guided.STOP
+        self.guided = GuidedFlight(self.parameters, self._navigator)
         self.home_ned_m: tuple[float, float, float] | None = None
         self.home_set = 0
         self.output = IDLE
         self.target_q_nb, self.throttle_in_01 = LEVEL, 0.0
         self._land_detector = LandDetector(self.parameters, self._navigator.hover_01, self._airborne)
-        self._setpoints = Setpoints(self.parameters)
         self._return_home = ReturnHome(self.parameters, self._navigator)
-        self._takeoff_z_m = 0.0
-        self._takeoff_reached = False
         self._estimate: Estimate | None = None
         self._now_us = 0
         self._initialised = self.has_origin = False
@@ -140,7 +135,7 @@ class ArduCopter:
 
     def base_mode(self) -> int:
         """HEARTBEAT.base_mode: bit 8 while the horizontal position controller is active."""
-        angle = self.mode == CopterMode.GUIDED and self.guided is Guided.ANGLE
+        angle = self.mode == CopterMode.GUIDED and self.guided.stage is Guided.ANGLE
         positions = self.mode not in WITHOUT_POSITION_CONTROL and not angle
         return BASE_ALWAYS | (BASE_POSITION_CONTROL if positions else 0) | (BASE_ARMED if self.armed else 0)
 
@@ -173,18 +168,18 @@ class ArduCopter:
         """Take a SET_ATTITUDE_TARGET, see `Setpoints.take`; return whether it will be flown."""
         if self.mode != CopterMode.GUIDED:
             return self._refuse("not_guided")
-        refusal = self._setpoints.take(type_mask, q_nb, rates, thrust, flown=self.target_q_nb, now_us=now_us)
+        refusal = self.guided.setpoints.take(type_mask, q_nb, rates, thrust, flown=self.target_q_nb, now_us=now_us)
         if refusal:
-            if refusal == SOME_RATES and self.guided is not Guided.STOP:
+            if refusal == SOME_RATES and self.guided.stage is not Guided.STOP:
                 self._enter_guided(Guided.STOP)
             return self._refuse(refusal)
-        if self.guided is not Guided.ANGLE:
+        if self.guided.stage is not Guided.ANGLE:
             self._enter_guided(Guided.ANGLE)
         if not self.armed:
             return True
         self.released = True
         if not self._land_detector.landed:  # acts at once: the real one's loop runs at 400 Hz
-            target = self._setpoints.target
+            target = self.guided.setpoints.target
             self._put_out(target.q_nb, self.throttle_in_01 if target.thrust_01 is None else target.thrust_01)
         return True
 
@@ -257,8 +252,8 @@ class ArduCopter:
         z_m = home[2] - height_m
         if not z_m < estimate.pos_ned_m[2]:  # not above it, or not a number
             return Result.FAILED
-        self._takeoff_z_m, self._takeoff_reached = z_m, False
-        if self.guided is not Guided.TAKEOFF:  # a repeated request continues the spin-up
+        self.guided.aim(z_m)
+        if self.guided.stage is not Guided.TAKEOFF:  # a repeated request continues the spin-up
             self._enter_guided(Guided.TAKEOFF)
         return Result.ACCEPTED
 
@@ -271,14 +266,14 @@ class ArduCopter:
 
     def _enter(self, mode: CopterMode) -> None:
         self.mode = mode
-        self.guided = Guided.STOP
+        self.guided.stage = Guided.STOP
         self._land_detector.stay()
         if self._estimate is not None and self.home_ned_m is not None:
             self._return_home.begin(self._estimate, self.home_ned_m)
         self._engage()
 
     def _enter_guided(self, what: Guided) -> None:
-        self.guided = what
+        self.guided.stage = what
         self._land_detector.stay()
         self._engage()
 
@@ -306,7 +301,7 @@ class ArduCopter:
         if self._land_detector.disarms(self.mode in ENDS_ON_GROUND, now_us):
             self._disarm()
             return
-        if self._land_detector.landed and not self._lifts_off(now_us):
+        if self._land_detector.landed and not self._lifts_off(estimate, now_us):
             self.throttle_in_01 = self._land_detector.takeoff_throttle_01(now_us) if self._takes_off() else 0.0
             self.output = Command(q_nb=IDLE.q_nb, thrust_01=self.throttle_in_01) if self.throttle_in_01 else IDLE
             return
@@ -334,14 +329,12 @@ class ArduCopter:
             self.send_text(Severity.WARNING, "GCS Failsafe")
             self._enter(CopterMode.LAND if action in (4, 5, 7) else CopterMode.RTL)
 
-    def _lifts_off(self, now_us: int) -> bool:
+    def _lifts_off(self, estimate: Estimate, now_us: int) -> bool:
         """Return whether a vehicle on the ground is to take off and its motors have spun up."""
-        asked = self.mode == CopterMode.GUIDED and (
-            self.guided is Guided.TAKEOFF or (self.guided is Guided.ANGLE and self._target().rises)
-        )
+        asked = self.mode == CopterMode.GUIDED and self.guided.wants_up(estimate, self.target_q_nb, now_us)
         if not asked:
             self._land_detector.stay()
-        if not asked or not self._land_detector.lifts_off(now_us, slowly=self.guided is Guided.TAKEOFF):
+        if not asked or not self._land_detector.lifts_off(now_us, slowly=self.guided.stage is Guided.TAKEOFF):
             return False
         self._engage()
         return True
@@ -356,15 +349,11 @@ class ArduCopter:
 
     # --- modes: attitude and throttle of this tick ---
 
-    def _level(self) -> Array:
-        _, _, yaw_rad = euler_from_quat(self.target_q_nb)
-        return quat_from_euler(0.0, 0.0, yaw_rad)
-
     def _stabilize(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
-        return self._level(), self._navigator.hover_01
+        return levelled(self.target_q_nb), self._navigator.hover_01
 
     def _alt_hold(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
-        return self._level(), self._navigator.hold_height(estimate, dt_s)
+        return levelled(self.target_q_nb), self._navigator.hold_height(estimate, dt_s)
 
     def _loiter(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
         return self._navigator.hold(estimate, dt_s), self._navigator.hold_height(estimate, dt_s)
@@ -377,27 +366,7 @@ class ArduCopter:
         return self._navigator.hold(estimate, dt_s), self._navigator.climb(estimate, -speed_m_s, dt_s)
 
     def _fly_guided(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
-        if self.guided is Guided.ANGLE:
-            return self._fly_angle(estimate, dt_s)
-        if self.guided is Guided.STOP:
-            return self._loiter(estimate, dt_s)
-        self._takeoff_reached |= estimate.pos_ned_m[2] <= self._takeoff_z_m + REACHED_M
-        throttle = self._navigator.to_height(estimate, self._takeoff_z_m, dt_s)
-        return self._navigator.hold(estimate, dt_s), throttle
-
-    def _fly_angle(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
-        target = self._setpoints.target = self._target().turned(dt_s)
-        if target.thrust_01 is not None:
-            return target.q_nb, target.thrust_01
-        return target.q_nb, self._navigator.climb(estimate, target.climb_m_s, dt_s)
-
-    def _target(self) -> Target:
-        """Return the newest setpoint; when it is too old: level, climb rate 0, for either meaning of thrust."""
-        if self._setpoints.stale(self._now_us):
-            if self._setpoints.target.thrust_01 is not None and self._estimate is not None:
-                self._navigator.engage(self._estimate)
-            self._setpoints.target = Target(q_nb=self._level())
-        return self._setpoints.target
+        return self.guided.fly(estimate, self.target_q_nb, self._now_us, dt_s)
 
     def _return(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
         if self._return_home.stage is ReturnStage.LAND:
@@ -410,4 +379,4 @@ class ArduCopter:
         )
 
     def _takes_off(self) -> bool:
-        return self.mode == CopterMode.GUIDED and self.guided is Guided.TAKEOFF and not self._takeoff_reached
+        return self.mode == CopterMode.GUIDED and self.guided.takes_off

@@ -1,4 +1,4 @@
-"""ArduCopter's GUIDED attitude setpoints: which are flown, the meaning of their thrust, and their timeout."""
+"""ArduCopter's GUIDED: which attitude setpoints are flown, the meaning of their thrust, their timeout, and take-off."""
 
 from __future__ import annotations
 
@@ -9,14 +9,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
+from sitl.plant.sensors import Estimate
 from sitl.plant.vehicle import Array
+from swarmctl.core.frames import euler_from_quat, quat_from_euler
 
 MASK_RATES, MASK_NO_THRUST, MASK_NO_ATTITUDE = 7, 64, 128
 OPTION_THRUST = 8  # GUID_OPTIONS: the thrust field is a thrust
 NORM_TOLERANCE = 1e-3  # of the squared norm of a setpoint's quaternion
 SOME_RATES = "some_rates"  # the refusal that also stops GUIDED
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+REACHED_M = 0.1
 _STILL = (0.0, 0.0, 0.0)
 
 
@@ -112,3 +116,62 @@ class Setpoints:
     def stale(self, now_us: int) -> bool:
         """Return whether no setpoint was accepted for GUID_TIMEOUT."""
         return now_us - self._accepted_us > self._parameters.real("GUID_TIMEOUT") * 1e6
+
+
+class GuidedFlight:
+    """GUIDED of one vehicle.
+
+    Attributes:
+        stage: what it flies at present.
+        setpoints: what it is sent.
+    """
+
+    def __init__(self, parameters: CopterParameters, navigator: CopterNavigator) -> None:
+        self.stage = Guided.STOP
+        self.setpoints = Setpoints(parameters)
+        self._navigator = navigator
+        self._takeoff_z_m = 0.0
+        self._takeoff_reached = False
+
+    def aim(self, z_ned_m: float) -> None:
+        """Set the height at which a take-off ends."""
+        self._takeoff_z_m, self._takeoff_reached = z_ned_m, False
+
+    @property
+    def takes_off(self) -> bool:
+        """Whether it is on the way to the height of a take-off."""
+        return self.stage is Guided.TAKEOFF and not self._takeoff_reached
+
+    def wants_up(self, estimate: Estimate, flown_q_nb: Array, now_us: int) -> bool:
+        """Return whether a vehicle on the ground is to leave it; arguments as in `fly`."""
+        if self.stage is Guided.ANGLE:
+            return self._target(estimate, flown_q_nb, now_us).rises
+        return self.stage is Guided.TAKEOFF
+
+    def fly(self, estimate: Estimate, flown_q_nb: Array, now_us: int, dt_s: float) -> tuple[Array, float]:
+        """Return attitude (4,) and throttle of this tick; `flown_q_nb` (4,) is the attitude of the last one."""
+        navigator = self._navigator
+        if self.stage is Guided.ANGLE:
+            target = self.setpoints.target = self._target(estimate, flown_q_nb, now_us).turned(dt_s)
+            if target.thrust_01 is not None:
+                return target.q_nb, target.thrust_01
+            return target.q_nb, navigator.climb(estimate, target.climb_m_s, dt_s)
+        if self.stage is Guided.STOP:
+            return navigator.hold(estimate, dt_s), navigator.hold_height(estimate, dt_s)
+        self._takeoff_reached |= estimate.pos_ned_m[2] <= self._takeoff_z_m + REACHED_M
+        throttle = navigator.to_height(estimate, self._takeoff_z_m, dt_s)
+        return navigator.hold(estimate, dt_s), throttle
+
+    def _target(self, estimate: Estimate, flown_q_nb: Array, now_us: int) -> Target:
+        """Return the newest setpoint; when it is too old: level, climb rate 0, for either meaning of thrust."""
+        if self.setpoints.stale(now_us):
+            if self.setpoints.target.thrust_01 is not None:
+                self._navigator.engage(estimate)
+            self.setpoints.target = Target(q_nb=levelled(flown_q_nb))
+        return self.setpoints.target
+
+
+def levelled(q_nb: Array) -> Array:
+    """Return the level attitude (4,) of the same yaw."""
+    _, _, yaw_rad = euler_from_quat(q_nb)
+    return quat_from_euler(0.0, 0.0, yaw_rad)
