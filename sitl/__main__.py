@@ -213,12 +213,14 @@ def _udp_links(options: argparse.Namespace, count: int) -> tuple[list[Transport]
 def _gcs_links(config: SimulatorConfig) -> tuple[list[Transport], str]:
     """Return the links to a ground station, and their addresses; none without a port for it."""
     from sitl import realtime
+    from sitl.autopilot_kinds import AUTOPILOT_KINDS
     from sitl.net.ports import OpenPort
 
     if not config.gcs_port:
         return [], ""
-    if config.autopilot_kind != "px4":
-        raise ConfigError("sitl", [f"gcs_port = {config.gcs_port}: allowed: with autopilot_kind = px4 only"])
+    if not AUTOPILOT_KINDS[config.autopilot_kind].has_gcs_link:
+        allowed = " or ".join(name for name, kind in AUTOPILOT_KINDS.items() if kind.has_gcs_link)
+        raise ConfigError("sitl", [f"gcs_port = {config.gcs_port}: allowed: with autopilot_kind = {allowed} only"])
     sockets, _ = realtime.bind_range(GCS_LOCAL_PORT, config.vehicles)
     first, last = sockets[0].getsockname()[1], sockets[-1].getsockname()[1]
     place = f"ground station link: local={first}..{last} remote={config.gcs_port}"

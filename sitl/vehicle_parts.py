@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from sitl.plant.sensors import Estimate
-from sitl.plant.vehicle import Array
+from sitl.boot import Boot
+from sitl.net.mavlink_values import Severity
+from sitl.net.signing import SigningRules
+from sitl.plant.imu import Imu
+from sitl.plant.sensors import Estimate, LocalOrigin
+from sitl.plant.vehicle import Array, Plant
 from swarmctl.core.types import FlightMode, Landed
 from swarmctl.mavlink.transport import Transport
+from swarmctl.simulator_config import SimulatorConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +84,13 @@ class Commander(Protocol):
     def parameters(self) -> ParameterTable:
         """The parameters of the autopilot."""
 
+    @property
+    def boot(self) -> Boot:
+        """Its own clock and local frame."""
+
+    def send_text(self, severity: Severity, text: str) -> None:
+        """Queue a STATUSTEXT on every link."""
+
     def flight_mode(self) -> FlightMode:
         """Return the flight mode, independent of the dialect."""
 
@@ -104,3 +117,45 @@ class MavlinkInterface(Protocol):
 
     def reboot(self, now_us: int) -> None:
         """Restart the autopilot as after power-up; `now_us` is on the clock of the simulation."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulatedVehicle:
+    """One vehicle of a world, as its autopilot is built for it.
+
+    Attributes:
+        number: its column in the plant.
+        origin: of its local frame.
+        since_boot_us: returns the time of the newest step, since the simulator's start.
+        estimate: returns the estimate of that instant.
+        sign: returns the links to its clients, with the signatures of the autopilot by these rules.
+    """
+
+    number: int
+    params: SimulatorConfig
+    origin: LocalOrigin
+    plant: Plant
+    imu: Imu
+    since_boot_us: Callable[[], int]
+    estimate: Callable[[], Estimate]
+    sign: Callable[[Commander, SigningRules], Sequence[Transport]]
+
+    @property
+    def sysid(self) -> int:
+        """Its MAVLink system id."""
+        return self.params.sysid_base + self.number
+
+    @property
+    def step_us(self) -> int:
+        """The physics step, the fastest message interval."""
+        return round(self.plant.dt_s * 1e6)
+
+    @property
+    def ekf_ready_us(self) -> int:
+        """When it can be armed, since its boot."""
+        return round(self.params.ekf_ready_s * 1e6)
+
+    @property
+    def airborne(self) -> bool:
+        """Whether it starts in the air."""
+        return self.params.start == "air"

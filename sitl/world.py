@@ -6,16 +6,16 @@ the same bytes give the same flight. Setpoints that have arrived by then act in 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.arducopter.endpoint import Start, arducopter_links, arducopter_pilot
+from sitl.autopilot_kinds import AUTOPILOT_KINDS
 from sitl.faults import Faults
 from sitl.net.lossy import LossyLink
-from sitl.net.signing import ARDUCOPTER_RULES, PX4_RULES, SigningLink, VehicleSigning
+from sitl.net.signing import SigningLink, SigningRules, VehicleSigning
 from sitl.plant.airframes import PRESETS
 from sitl.plant.attitude import attitude_loop
 from sitl.plant.estimator import ESTIMATORS, Estimator
@@ -23,13 +23,7 @@ from sitl.plant.imu import Imu
 from sitl.plant.physics import Physics, outfitted
 from sitl.plant.sensors import FULL, local_origin
 from sitl.plant.vehicle import Array, Plant
-from sitl.px4.autopilot import Autopilot
-from sitl.px4.link.endpoint import Endpoint
-from sitl.px4.link.schedule import GCS_HZ
-from sitl.px4.link.streams import Report
-from sitl.px4.navigator import Navigator
-from sitl.px4.parameters import Parameters
-from sitl.vehicle_parts import IDLE, Commander, MavlinkInterface
+from sitl.vehicle_parts import IDLE, Commander, MavlinkInterface, SimulatedVehicle
 from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.core.types import FlightMode, GeoOrigin
 from swarmctl.mavlink.signing.signature import SigningKey
@@ -37,7 +31,6 @@ from swarmctl.mavlink.transport import Transport
 from swarmctl.simulator_config import SimulatorConfig
 
 AUTOPILOT_HZ = 50
-_SCALED_TIMEOUTS = ("COM_OF_LOSS_T", "COM_DL_LOSS_T", "COM_RC_LOSS_T")
 _LINK_PURPOSE, _GCS_LINK_PURPOSE = 3, 4  # purposes of random streams, beside run seed and vehicle
 
 
@@ -83,11 +76,12 @@ class SitlWorld:
         ]
         self.signing: list[VehicleSigning] = []
         self._keys = keys
-        build = self._arducopter if params.autopilot_kind == "arducopter" else self._px4
+        self._kind = AUTOPILOT_KINDS[params.autopilot_kind]
         for i in range(count):
-            pilot, endpoint = build(i)
+            pilot, interfaces = self._kind.build(self._vehicle(i))
             self.autopilots.append(pilot)
-            self.endpoints.append(endpoint)
+            self.endpoints.append(interfaces[0])
+            self.gcs_endpoints.extend(interfaces[1:])
         self._metered = [pilot if isinstance(pilot, Metered) else None for pilot in self.autopilots]
         self._wrench = np.zeros((4, count))
         self._powered = np.zeros(count, dtype=bool)
@@ -163,7 +157,7 @@ class SitlWorld:
     def scale_timeouts(self, speed: float) -> None:
         """Keep timeouts constant in wall time, as PX4 does when it starts a simulation faster than real time."""
         for pilot in self.autopilots:
-            for name in _SCALED_TIMEOUTS if self.params.autopilot_kind == "px4" else ():
+            for name in self._kind.scaled_timeouts:
                 pilot.parameters.assign(name, speed * pilot.parameters.real(name))
 
     @property
@@ -222,73 +216,24 @@ class SitlWorld:
         live = np.greater(self._powered, self._kept)
         return live.astype(np.float64) if False in live.tolist() else None
 
-    def _signed(self, vehicle: int, signing: VehicleSigning) -> list[SigningLink]:
+    def _vehicle(self, number: int) -> SimulatedVehicle:
+        return SimulatedVehicle(
+            number=number,
+            params=self.params,
+            origin=self.origins[number],
+            plant=self.plant,
+            imu=self.imu,
+            since_boot_us=lambda: self.since_boot_us,
+            estimate=lambda: self.estimator.of(number, self.since_boot_us),
+            sign=lambda pilot, rules: self._signed(number, pilot, rules),
+        )
+
+    def _signed(self, vehicle: int, pilot: Commander, rules: SigningRules) -> list[SigningLink]:
         """Return the links of a vehicle with its signatures."""
+        signing = VehicleSigning(
+            rules=rules, armed=lambda: pilot.armed, boot_us=lambda: pilot.boot.at_us, tell=pilot.send_text
+        )
         self.signing.append(signing)
         signing.key = self._keys[vehicle] if self._keys else None
         sysid = self.params.sysid_base + vehicle
         return [SigningLink(link, signing, number, sysid) for number, link in enumerate(self.links_of(vehicle))]
-
-    def _px4(self, vehicle: int) -> tuple[Commander, MavlinkInterface]:
-        params, table = self.params, Parameters(self.params.sysid_base + vehicle)
-        navigator = Navigator(table, self.plant.hover_thrust_01)
-        airborne = params.start == "air"
-        pilot = Autopilot(
-            table,
-            navigator,
-            ekf_ready_us=round(params.ekf_ready_s * 1e6),
-            airborne=airborne,
-            reject_bad_setpoints=params.reject_bad_setpoints,
-        )
-        pilot.start_at(self.origins[vehicle])
-        sysid, step_us = params.sysid_base + vehicle, round(self.plant.dt_s * 1e6)
-        report = self._publisher(vehicle, pilot)
-        signing = VehicleSigning(
-            rules=PX4_RULES, armed=lambda: pilot.armed, boot_us=lambda: pilot.boot.at_us, tell=pilot.send_text
-        )
-        links = self._signed(vehicle, signing)
-        endpoint = Endpoint(sysid, links[0], pilot, report, step_us=step_us)
-        if self._gcs_links:
-            ground = Endpoint(sysid, links[1], pilot, report, step_us=step_us, default_hz=GCS_HZ)
-            self.gcs_endpoints.append(ground)
-            endpoint.join(ground)
-        return pilot, endpoint
-
-    def _arducopter(self, vehicle: int) -> tuple[Commander, MavlinkInterface]:
-        params = self.params
-        start = Start(
-            origin=self.origins[vehicle],
-            estimate=lambda: self.estimator.of(vehicle, self._now_us - (self._boot_us or 0)),
-            ekf_ready_us=round(params.ekf_ready_s * 1e6),
-            airborne=params.start == "air",
-        )
-        sysid = params.sysid_base + vehicle
-        pilot = arducopter_pilot(sysid, self.plant, start)
-        signing = VehicleSigning(
-            rules=ARDUCOPTER_RULES, armed=lambda: pilot.armed, boot_us=lambda: pilot.boot.at_us, tell=pilot.send_text
-        )
-        interfaces = arducopter_links(sysid, self._signed(vehicle, signing), pilot, self.plant, vehicle, start=start)
-        self.gcs_endpoints.extend(interfaces[1:])
-        return pilot, interfaces[0]
-
-    def _publisher(self, vehicle: int, pilot: Autopilot) -> Callable[[], Report]:
-        origin = self.origins[vehicle]
-        cached: list[Report] = []  # of the newest step, for the other link
-
-        def report() -> Report:
-            now_us = self._now_us - (self._boot_us or 0)
-            if cached and cached[0].simulation_us == now_us:
-                return cached[0]
-            estimate = pilot.boot.local(self.estimator.of(vehicle, now_us))
-            made = Report(
-                estimate=estimate,
-                autopilot=pilot,
-                origin=pilot.boot.origin or origin,
-                rotor_01=lambda: self.plant.rotor_01(vehicle),
-                force_frd_m_s2=lambda: self.imu.of(vehicle),
-                simulation_us=now_us,
-            )
-            cached[:] = [made]
-            return made
-
-        return report

@@ -8,22 +8,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 from pymavlink.dialects.v20 import development as mav
 
 from sitl.arducopter.autopilot import FORCE_ARM, FORCE_DISARM, ArduCopter
 from sitl.arducopter.modes import CopterMode
-from sitl.arducopter.navigator import CopterNavigator
-from sitl.arducopter.parameters import CopterParameters
 from sitl.arducopter.streams import ALL_GROUPS, STREAMS, CopterReport, Intervals
 from sitl.net.mavlink_values import Result, Severity
 from sitl.net.wire import KINDS, FrameWriter, Kind
 from sitl.parameter_values import UnknownParameterError, WireValue
-from sitl.plant.sensors import Estimate, LocalOrigin
-from sitl.plant.vehicle import Plant
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import Transport
@@ -40,16 +35,6 @@ _TEXT = KINDS[mav.MAVLINK_MSG_ID_STATUSTEXT]
 _TIMESYNC = KINDS[mav.MAVLINK_MSG_ID_TIMESYNC]
 _VALUE = KINDS[mav.MAVLINK_MSG_ID_PARAM_VALUE]
 Params = tuple[float, float, float, float, float, float, float]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Start:
-    """Initial conditions of a vehicle."""
-
-    origin: LocalOrigin
-    estimate: Callable[[], Estimate]  # of this instant
-    ekf_ready_us: int
-    airborne: bool
 
 
 class ArduCopterEndpoint:
@@ -328,27 +313,3 @@ class ArduCopterEndpoint:
 def _whole(value: float) -> int | None:
     """Return the integer of a command parameter; None for NaN and infinities."""
     return int(value) if math.isfinite(value) else None
-
-
-def arducopter_pilot(sysid: int, plant: Plant, start: Start) -> ArduCopter:
-    """Return the autopilot of one vehicle of a plant."""
-    parameters = CopterParameters(sysid)
-    navigator = CopterNavigator(parameters, plant.hover_thrust_01)
-    return ArduCopter(parameters, navigator, start.origin, ekf_ready_us=start.ekf_ready_us, airborne=start.airborne)
-
-
-def arducopter_links(
-    sysid: int, links: Sequence[Transport], pilot: ArduCopter, plant: Plant, vehicle: int, *, start: Start
-) -> list[ArduCopterEndpoint]:
-    """Return the MAVLink interface of an autopilot on each of its links."""
-
-    def report() -> CopterReport:
-        return CopterReport(
-            estimate=pilot.boot.local(start.estimate()),
-            pilot=pilot,
-            origin=pilot.boot.origin or start.origin,
-            rotor_01=lambda: plant.rotor_01(vehicle),
-        )
-
-    step_us = round(plant.dt_s * 1e6)
-    return [ArduCopterEndpoint(sysid, link, pilot, report, step_us=step_us) for link in links]

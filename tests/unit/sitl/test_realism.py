@@ -8,6 +8,7 @@ from typing import get_args
 import pytest
 
 from sitl.__main__ import _config, _parser
+from sitl.autopilot_kinds import AUTOPILOT_KINDS
 from sitl.lockstep import Lockstep
 from sitl.plant.airframes import PRESETS
 from sitl.plant.attitude import THESIS_GAINS
@@ -76,6 +77,10 @@ def test_faults_of_a_configuration_happen_in_lockstep_and_are_logged(config: Con
         flight.step()
     events = [(e["event"], e["kind"], e["vehicle"], e["since_boot_us"]) for e in flight.fault_events]
     assert events == [("fault_began", "motor", 1, 200_000), ("fault_ended", "motor", 1, 300_000)]
+
+
+def test_every_autopilot_that_a_configuration_can_name_has_a_row() -> None:
+    assert set(AUTOPILOT_KINDS) == set(get_args(SimulatorConfig.model_fields["autopilot_kind"].annotation))
 
 
 @pytest.mark.parametrize(
