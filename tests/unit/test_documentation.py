@@ -31,6 +31,7 @@ QUOTED = re.compile(r"`([^`\s]+)`")
 PACKAGES = "|".join(path.parent.name for path in (ROOT / "swarmctl").glob("*/__init__.py"))
 IN_PACKAGE = re.compile(rf"({PACKAGES})(\.[a-z]\w*)+")  # a module by its name within the bridge
 FOLDERS = ("swarmctl/", "sitl/", "tests/", "tools/", "configs/", "docs/")
+PLUG_INS = {"swarmctl/control/controllers/", "swarmctl/control/reference/kinds/", "swarmctl/mavlink/dialects/"}
 
 
 def test_the_page_of_the_configuration_is_what_the_script_writes() -> None:
@@ -139,6 +140,25 @@ def test_what_troubleshooting_quotes_is_said_by_the_code() -> None:
 def test_links_lead_to_files(page: Path) -> None:
     links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
     assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
+
+
+def test_the_page_of_the_architecture_names_every_module() -> None:
+    """Each in the row of its folder, or in one of its own; modules that are found by being there need none."""
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    named = set()
+    for where, what in re.findall(r"^\| (.*?) \| (.*) \|$", page, re.MULTILINE):
+        places, names = QUOTED.findall(where), QUOTED.findall(what)
+        named |= {*places, *(f"{place}{name}" for place in places if place.endswith("/") for name in names)}
+    paths = [path.relative_to(ROOT) for folder in ("swarmctl", "sitl") for path in (ROOT / folder).rglob("*.py")]
+    modules = {str(path) for path in paths if path.name != "__init__.py" and f"{path.parent}/" not in PLUG_INS}
+    assert len(modules) > 300
+    assert modules - named == set()
+
+
+def test_the_table_of_tools_names_every_tool() -> None:
+    page = (ROOT / "docs" / "extending.md").read_text()
+    tools = {f"tools/{path.name}" for path in (ROOT / "tools").glob("*.py")}
+    assert tools - set(re.findall(r"^\| `(tools/\w+\.py)` \|", page, re.MULTILINE)) == set()
 
 
 def is_ours(name: str) -> bool:
