@@ -34,7 +34,7 @@ from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.json_safe import json_safe
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows
-from swarmctl.core.types import Plan
+from swarmctl.core.types import Phase, Plan
 from swarmctl.errors import ConfigError
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
@@ -233,6 +233,10 @@ class Lockstep:
     @property
     def finished(self) -> bool:
         return all(agent is None or agent.finished for agent in self.agents)
+
+    def mission_is_over(self) -> bool:
+        """Return whether no agent is on the way to its mission or in it any more."""
+        return all(len(log.rows) and log.rows[-1]["phase"][0] > Phase.TRACK for log in self.logs)
 
     @property
     def truth(self) -> NDArray[np.void]:

@@ -25,6 +25,7 @@ import swarmctl.kernels  # noqa: F401  # isort: skip  # before numpy, for the sa
 import numpy as np
 
 from sitl.lockstep import Lockstep
+from sitl.studies.campaign.conditions.layouts import nudged
 from swarmctl.bus.bus import agent_name
 from swarmctl.config import load
 from swarmctl.control.mpc.condensed import CondensedMpc
@@ -32,7 +33,6 @@ from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array, Phase
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-NUDGE_M = 1e-3
 ARRIVED_M = 0.1
 CLOSE_M = 0.85
 SILENT = 1
@@ -95,9 +95,7 @@ def fly(case: Case) -> Flown:
     flight, (solver, proximal) = FLIGHTS[case.flight], case.way.split(":")
     sets = (*flight.sets, f"controller.mpc.qp.solver={solver}", f"controller.mpc.proximal_xy={proximal}", *case.more)
     path = CONFIGS / "swap8.toml"
-    starts = np.array(load(path, sets).starts_ned_m())
-    if case.start:
-        starts[:, :2] += np.random.default_rng(case.start).uniform(-NUDGE_M, NUDGE_M, (len(starts), 2))
+    starts = nudged(np.array(load(path, sets).starts_ned_m()), case.start)
     lockstep = Lockstep(load(path, (*sets, f"start.positions_ned_m={json.dumps(starts.tolist())}")))
     solved_ns = list[int]()
     solve = CondensedMpc.solve

@@ -21,12 +21,12 @@ import swarmctl.kernels  # noqa: F401  # isort: skip  # before numpy, for the sa
 import numpy as np
 
 from sitl.lockstep import Lockstep
+from sitl.studies.campaign.conditions.layouts import nudged
 from swarmctl.config import load
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Phase, PlanStatus
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-NUDGE_M = 1e-3
 PATH_TOPICS = ("path", "far_path")
 FLIGHTS: dict[str, tuple[str | None, tuple[str, ...]]] = {
     "circle": (None, ("mission.duration_s=25",)),
@@ -80,12 +80,11 @@ def fly(case: Case) -> Flown:
     sharing = f"agent.path_sharing={SHARING[case.sharing]}"
     links = (f"bus.delay_ms={case.delay_ms}", f"bus.loss_01={case.loss_01}", f"seed={case.seed}")
     sets = (*sets, *links, sharing, "sitl.start=air")
-    starts = np.array(load(path, sets).starts_ned_m())
-    starts[:, :2] += np.random.default_rng(case.seed).uniform(-NUDGE_M, NUDGE_M, (len(starts), 2))
+    starts = nudged(np.array(load(path, sets).starts_ned_m()), case.seed)
     flight = Lockstep(load(path, (*sets, f"start.positions_ned_m={starts.tolist()}")))
     sent: Counter[str] = Counter()
     tracked = 0
-    while not _is_over(flight):
+    while not flight.mission_is_over():
         before = _sent(flight)
         tracks = [_phase(flight, agent) == Phase.TRACK for agent in range(len(flight.agents))]
         flight.step()
@@ -98,10 +97,6 @@ def fly(case: Case) -> Flown:
 def _phase(flight: Lockstep, agent: int) -> int:
     rows = flight.logs[agent].rows
     return int(rows[-1]["phase"][0]) if rows else -1
-
-
-def _is_over(flight: Lockstep) -> bool:
-    return all(_phase(flight, agent) > Phase.TRACK for agent in range(len(flight.agents)))
 
 
 def _sent(flight: Lockstep) -> Counter[str]:

@@ -92,7 +92,7 @@ def _settings(seed: int, wind: Sequence[float], lists: Array) -> list[str]:
 def flown(config: Config, judged: FlightVolume) -> dict[str, Any]:
     """Fly a configuration until the mission is over, and return what happened."""
     lockstep, began_s = Lockstep(config), time.perf_counter()
-    lockstep.run(_mission_is_over)
+    lockstep.run(Lockstep.mission_is_over)
     truth = lockstep.truth.reshape(-1, AGENTS)
     ticks = [log.ticks for log in lockstep.logs]
     tracked_us = max(int(rows["t_us"][rows["phase"] >= Phase.READY].min()) for rows in ticks)
@@ -111,10 +111,6 @@ def flown(config: Config, judged: FlightVolume) -> dict[str, Any]:
         "outcomes": sorted({agent.outcome for agent in lockstep.agents if agent is not None}),
         "took_s": time.perf_counter() - began_s,
     }
-
-
-def _mission_is_over(lockstep: Lockstep) -> bool:
-    return all(log.rows and log.rows[-1]["phase"][0] > Phase.TRACK for log in lockstep.logs)
 
 
 def _beyond(config: Config, volume: VolumeParams) -> Config:

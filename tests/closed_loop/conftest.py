@@ -18,13 +18,13 @@ import pytest
 from numpy.typing import NDArray
 
 from sitl.lockstep import Lockstep
+from sitl.studies.campaign.conditions.layouts import nudged
 from swarmctl.config import Config, load
 from swarmctl.core.closest_pair import closest_pair_m
-from swarmctl.core.types import Array, Mode, Phase
+from swarmctl.core.types import Mode, Phase
 from swarmctl.simulator_config import SimulatorConfig
 
 ROOT = Path(__file__).parents[2]
-_NUDGE_M = 1e-3
 # Physics of campaigns (`sitl.studies.campaign.flight.PHYSICS_HZ`), by which the airframes of `_ALIKE` fly as they do by
 # the configured ones, for five sixths of the work.
 AT_100_HZ = "sitl.physics_hz=100"
@@ -107,14 +107,6 @@ class Flight:
 Fly = Callable[..., Flight]
 
 
-def nudged(starts_ned_m: Array, seed: int) -> Array:
-    """Return places (N, 3) shifted by up to a millimetre in the plane; seed 0 leaves them unchanged."""
-    offsets = np.zeros(starts_ned_m.shape)
-    if seed:
-        offsets[:, :2] = np.random.default_rng(seed).uniform(-_NUDGE_M, _NUDGE_M, (len(starts_ned_m), 2))
-    return starts_ned_m + offsets
-
-
 def fly_now(
     *overrides: str,
     config: str | None = None,
@@ -156,11 +148,6 @@ def mission_t_s(lockstep: Lockstep) -> float:
     """Return the newest mission time [s] of any agent that is tracking, else -1."""
     times = [float(log.rows[-1]["mission_t_s"][0]) for log in lockstep.logs if log.rows]
     return max((t for t in times if np.isfinite(t)), default=-1.0)
-
-
-def mission_is_over(lockstep: Lockstep) -> bool:
-    """Return whether no agent is on its transit to the start or in the mission any more."""
-    return all(len(log.rows) and log.rows[-1]["phase"][0] > Phase.TRACK for log in lockstep.logs)
 
 
 def closer_than(bound_m: float) -> Callable[[Lockstep], bool]:

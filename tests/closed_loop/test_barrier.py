@@ -11,7 +11,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from swarmctl.control.collision import barrier
 from swarmctl.core.obstacle import Obstacle
-from tests.closed_loop.conftest import AT_100_HZ, COARSE, FINE, ROOT, Flight, Fly, mission_is_over
+from tests.closed_loop.conftest import AT_100_HZ, COARSE, FINE, ROOT, Flight, Fly
 
 NO_ROWS = ("mission.kind=swap", "sitl.start=air", "controller.kind=mpc", "mission.duration_s=7")
 OFF = "agent.barrier.enabled=false"
@@ -78,7 +78,7 @@ def test_negative_control_of_a_lag_that_it_is_not_told_of_they_touch() -> None:
 
 def test_it_leaves_an_ordinary_flight_alone_bit_by_bit(fly: Fly) -> None:
     short = (*COARSE, "sitl.start=air", "mission.duration_s=2")
-    with_it, without = fly(*short, until=mission_is_over), fly(*short, OFF, until=mission_is_over)
+    with_it, without = fly(*short, until=Lockstep.mission_is_over), fly(*short, OFF, until=Lockstep.mission_is_over)
     assert not any(safety_filter_ticks(with_it))
     assert with_it.lockstep.truth.tobytes() == without.lockstep.truth.tobytes()
     for i in range(3):

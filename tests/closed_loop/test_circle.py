@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sitl.lockstep import Lockstep
 from swarmctl.control.mpc import swarm_mpc
 from swarmctl.core.types import Landed, Mode, Phase, PlanStatus
-from tests.closed_loop.conftest import FINE, Flight, Fly, closer_than, mission_is_over, mission_t_s
+from tests.closed_loop.conftest import FINE, Flight, Fly, closer_than, mission_t_s
 
 ALONE = (FINE, "sitl.start=air", "swarm.agents=1", "mission.duration_s=15")
 
@@ -33,7 +34,7 @@ def test_summed_mean_tracking_error(circle: Flight) -> None:
 
 def test_without_more_room_for_who_comes_closer_the_error_is_within_3_percent_of_its_lower_bound(fly: Fly) -> None:
     """Agents in a formation swing by centimetres, for which `separation.approach_01` keeps room: 2 to 3 %."""
-    flight = fly(FINE, "separation.approach_01=0", "sitl.start=air", until=mission_is_over)
+    flight = fly(FINE, "separation.approach_01=0", "sitl.start=air", until=Lockstep.mission_is_over)
     assert flight.summed_mean_error_m(after_s=10.0) <= 1.03 * np.sqrt(3) * 0.9
 
 
@@ -67,7 +68,7 @@ def test_negative_control_agents_that_ignore_each_other_collide(fly: Fly) -> Non
 
 def test_compact_paths_shared_by_event_cost_a_tenth_of_the_traffic_and_no_separation(circle: Flight, fly: Fly) -> None:
     sparing = "agent.path_sharing={error_m=0.002,compact=true}"
-    by_event = fly(FINE, sparing, "sitl.start=air", "mission.duration_s=8", until=mission_is_over)
+    by_event = fly(FINE, sparing, "sitl.start=air", "mission.duration_s=8", until=Lockstep.mission_is_over)
     for agent, flown in zip(range(3), by_event.lockstep.agents, strict=True):
         assert flown is not None
         sent = flown.sent["path"]
@@ -82,14 +83,14 @@ def test_compact_paths_shared_by_event_cost_a_tenth_of_the_traffic_and_no_separa
 
 
 def test_a_wrong_mass_costs_no_altitude(fly: Fly) -> None:
-    heavy = fly("sitl.mass_scale=1.25", *ALONE, until=mission_is_over)
+    heavy = fly("sitl.mass_scale=1.25", *ALONE, until=Lockstep.mission_is_over)
     ticks, error = heavy.tracked(0)
     assert np.abs(error[ticks["mission_t_s"] > 10, 2]).max() < 0.01
 
 
 def test_negative_control_without_the_observer_a_wrong_mass_does(fly: Fly) -> None:
     off = ("agent.disturbance.enabled=false",)
-    heavy = fly("sitl.mass_scale=1.25", *ALONE, *off, until=mission_is_over)
+    heavy = fly("sitl.mass_scale=1.25", *ALONE, *off, until=Lockstep.mission_is_over)
     ticks, error = heavy.tracked(0)
     assert np.abs(error[ticks["mission_t_s"] > 10, 2]).mean() > 0.05
 
@@ -99,14 +100,14 @@ def test_thrust_stays_calm_with_half_a_tick_of_latency_but_not_under_the_equalit
     fly: Fly, terminal: str, calm: bool
 ) -> None:
     late = (FINE, "sitl.link_latency_ms=10", f"controller.mpc.terminal_z={terminal}", "swarm.agents=1")
-    flight = fly("sitl.start=air", "mission.duration_s=12", *late, until=mission_is_over)
+    flight = fly("sitl.start=air", "mission.duration_s=12", *late, until=Lockstep.mission_is_over)
     ticks = flight.ticks(0)
     spread_01 = float(ticks["setpoint_thrust_01"][ticks["mission_t_s"] > 8.0].std())
     assert spread_01 < 0.02 if calm else spread_01 > 0.1
 
 
 def test_without_peers_the_reference_is_met(fly: Fly) -> None:
-    lone = fly(*ALONE, until=mission_is_over)
+    lone = fly(*ALONE, until=Lockstep.mission_is_over)
     ticks, error = lone.tracked(0)
     assert np.linalg.norm(error[ticks["mission_t_s"] > 10], axis=1).max() < 0.01
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from sitl.lockstep import Lockstep
 from swarmctl.config import load
-from tests.closed_loop.conftest import ROOT, Fly, mission_is_over
+from tests.closed_loop.conftest import ROOT, Fly
 
 FLOWN_ELSEWHERE = {  # and for longer
     "swap8": "swap",
@@ -33,6 +34,6 @@ def test_every_config_flies_or_is_valid(fly: Fly, name: str) -> None:
     if test := FLOWN_ELSEWHERE.get(config.name):
         assert name in (ROOT / "tests" / "closed_loop" / f"test_{test}.py").read_text(encoding="utf-8")
         return
-    flight = fly("mission.duration_s=2", "sitl.start=air", config=name, until=mission_is_over)
+    flight = fly("mission.duration_s=2", "sitl.start=air", config=name, until=Lockstep.mission_is_over)
     assert flight.outcomes == {"completed"}
     assert config.swarm.agents == 1 or flight.separation_m() >= 0.85

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.conditions.layouts import least_sum_m, ring
+from sitl.studies.campaign.conditions.layouts import least_sum_m, nudged, ring
 from sitl.studies.campaign.conditions.scenarios import layout_of
 from swarmctl.config import load
 from swarmctl.control.reference.kinds import goto
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array
-from tests.closed_loop.conftest import AT_100_HZ, nudged
+from tests.closed_loop.conftest import AT_100_HZ
 
 SMALL = (  # bodies of 15 cm that keep 30 cm
     "sitl.preset=crazyflie",

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.closed_loop.conftest import Flight, Fly, mission_is_over
+from sitl.lockstep import Lockstep
+from tests.closed_loop.conftest import Flight, Fly
 
 CROSSING = (
     "swarm.agents=2",
@@ -25,7 +26,7 @@ def scaled_m(flight: Flight, downwash: float) -> float:
 
 @pytest.mark.parametrize("kind", ["dmpc", "dmpc3"])  # one goes round, the other over
 def test_no_vehicle_passes_closely_below_another(fly: Fly, kind: str) -> None:
-    flight = fly(*CROSSING, f"controller.kind={kind}", "separation.downwash=2.0", until=mission_is_over)
+    flight = fly(*CROSSING, f"controller.kind={kind}", "separation.downwash=2.0", until=Lockstep.mission_is_over)
     assert flight.outcomes == {"completed"}
     assert scaled_m(flight, 2.0) >= 0.85
     for agent in (0, 1):
@@ -34,6 +35,6 @@ def test_no_vehicle_passes_closely_below_another(fly: Fly, kind: str) -> None:
 
 
 def test_negative_control_as_spheres_they_do(fly: Fly) -> None:
-    flight = fly(*CROSSING, until=mission_is_over)
+    flight = fly(*CROSSING, until=Lockstep.mission_is_over)
     assert scaled_m(flight, 1.0) >= 0.85
     assert scaled_m(flight, 2.0) < 0.7

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sitl.lockstep import Lockstep
 from swarmctl.core.types import Mode, Phase
-from tests.closed_loop.conftest import Flight, fly_now, mission_is_over
+from tests.closed_loop.conftest import Flight, fly_now
 
 PAIR = (
     "swarm.agents=2",
@@ -25,7 +26,7 @@ PAIR = (
 def drained(charge_01: float, *overrides: str) -> Flight:
     """Fly a pair; in the first seconds of the mission the battery of vehicle 0 is down to a charge."""
     drain = f"sitl.faults=[{{kind='battery', vehicle=0, value={charge_01}, at_s=7.5}}]"
-    return fly_now(*PAIR, drain, *overrides, until=None if not overrides else mission_is_over)
+    return fly_now(*PAIR, drain, *overrides, until=None if not overrides else Lockstep.mission_is_over)
 
 
 def responses(flight: Flight, agent: int) -> list[str]:

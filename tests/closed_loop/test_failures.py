@@ -18,7 +18,7 @@ from swarmctl.control.mpc import swarm_mpc as mpc
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from swarmctl.mavlink.codec import Codec
 from tests.benches.broken_solver import break_solver
-from tests.closed_loop.conftest import COARSE, Fly, closer_than, fly_now, mission_is_over, mission_t_s
+from tests.closed_loop.conftest import COARSE, Fly, closer_than, fly_now, mission_t_s
 
 AIR = "sitl.start=air"
 
@@ -70,7 +70,7 @@ def test_a_frozen_agent_is_landed_by_its_autopilot_and_never_retakes_control(fly
         "swarm.agents=2",
         "mission.duration_s=9",
         at={4.0: lambda running: running.frozen.add(1), 7.0: lambda running: running.frozen.discard(1)},
-        until=mission_is_over,
+        until=Lockstep.mission_is_over,
     )
     assert landed_by_itself(flight.lockstep.truth, 1, 2)
     assert flight.separation_m() >= 0.85
@@ -213,7 +213,7 @@ def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: py
     """The QP has no half-spaces and the safety filter is off: only the certifier, which is separate code, remains."""
     monkeypatch.setattr(mpc, "half_spaces", lambda *_, **__: None)
     unfiltered = (AIR, "agent.barrier.enabled=false")
-    certified = fly("mission.duration_s=8", *unfiltered, until=mission_is_over).separation_m()
+    certified = fly("mission.duration_s=8", *unfiltered, until=Lockstep.mission_is_over).separation_m()
     monkeypatch.setattr(judgement, "certify", lambda *_, **__: 1.0)
     uncertified = fly("mission.duration_s=5", *unfiltered, until=closer_than(0.3)).separation_m()
     assert uncertified < 0.3 < 0.6 < certified
@@ -226,7 +226,7 @@ def test_ten_seconds_of_bus_silence(fly: Fly) -> None:
     def speak(running: Lockstep) -> None:
         del running.hub.carry
 
-    flight = fly("mission.duration_s=20", AIR, at={5.0: silence, 15.0: speak}, until=mission_is_over)
+    flight = fly("mission.duration_s=20", AIR, at={5.0: silence, 15.0: speak}, until=Lockstep.mission_is_over)
     assert flight.separation_m() >= 0.80
 
 

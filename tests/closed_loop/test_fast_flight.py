@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from sitl.lockstep import Lockstep
 from sitl.studies.campaign.conditions.scenarios import layout_of
 from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.core.types import Phase
-from tests.closed_loop.conftest import Flight, Fly, mission_is_over
+from tests.closed_loop.conftest import Flight, Fly
 
 SETTLED_S = 4.0  # of the circle, flown from rest
 FAST_SWAP = Cell(
@@ -18,7 +19,11 @@ FAST_SWAP = Cell(
 
 def circled(fly: Fly, *settings: str) -> Flight:
     return fly(
-        "mission.duration_s=12", "sitl.start=air", *settings, config="x500_fast_circle.toml", until=mission_is_over
+        "mission.duration_s=12",
+        "sitl.start=air",
+        *settings,
+        config="x500_fast_circle.toml",
+        until=Lockstep.mission_is_over,
     )
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sitl.lockstep import Lockstep
 from swarmctl.core.types import Array
-from tests.closed_loop.conftest import Flight, Fly, mission_is_over
+from tests.closed_loop.conftest import Flight, Fly
 
 
 def errors_m(flight: Flight) -> tuple[Array, Array, Array]:
@@ -24,7 +25,7 @@ def rms(values: Array) -> float:
 
 def flown(fly: Fly, speed_m_s: float, *settings: str) -> Flight:
     fast = f"mission.waypoints.speed_m_s={speed_m_s}", f"mission.duration_s={44.0 / speed_m_s}"
-    return fly(*fast, "sitl.start=air", *settings, config="x500_figure_8.toml", until=mission_is_over)
+    return fly(*fast, "sitl.start=air", *settings, config="x500_figure_8.toml", until=Lockstep.mission_is_over)
 
 
 @pytest.mark.parametrize(("speed_m_s", "true_m", "believed_m"), [(2.0, 0.06, 0.02), (4.0, 0.15, 0.03)])

@@ -21,7 +21,7 @@ from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import Array, Phase
 from tests.benches.guaranteed_trials import GUARANTEED_SWAP, TUBE_M, events, flown
-from tests.closed_loop.conftest import ROOT, fly_now, mission_is_over, mission_t_s
+from tests.closed_loop.conftest import ROOT, fly_now, mission_t_s
 
 
 class HeldUp:
@@ -98,7 +98,7 @@ def off_commitments_m(shown_m: float = math.inf) -> float:
         return max(policy.coordination.worst_tracking_m for policy in policies if isinstance(policy, Guaranteed))
 
     def rest() -> bool:
-        return mission_is_over(flight) and float(np.linalg.norm(flight.world.plant.vel_ned_m_s, axis=0).max()) < 0.1
+        return flight.mission_is_over() and float(np.linalg.norm(flight.world.plant.vel_ned_m_s, axis=0).max()) < 0.1
 
     flight.run(lambda _: off_m() > shown_m or rest())
     assert off_m() > shown_m or rest(), "it ended before"

@@ -12,7 +12,7 @@ from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.control.estimation import accuracy
 from swarmctl.core.types import Landed
 from swarmctl.mavlink.vehicle import autopilot
-from tests.closed_loop.conftest import Flight, Fly, closer_than, mission_is_over
+from tests.closed_loop.conftest import Flight, Fly, closer_than
 from tests.closed_loop.test_handover import COPTER
 
 AT_S = 3.0
@@ -61,7 +61,7 @@ def test_negative_control_a_lost_position_that_is_believed_is_followed(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(autopilot, "_LOST_REPORTS", 1_000_000)
-    flight = fly_without_gps(fly, (*ALONE, *NOT_LANDED), until=mission_is_over)
+    flight = fly_without_gps(fly, (*ALONE, *NOT_LANDED), until=Lockstep.mission_is_over)
     assert flight.outcomes == {"completed"}
     assert strayed_m(flight) > 5 * LANDED_M
 
@@ -82,7 +82,7 @@ def separation_aloft_m(flight: Flight) -> float:
 
 def one_is_down(running: Lockstep) -> bool:
     """No mission is under way, and one of the two has landed: what the other one does is not judged."""
-    return mission_is_over(running) and bool((running.world.truth_rows()["landed"] == Landed.ON_GROUND).any())
+    return running.mission_is_over() and bool((running.world.truth_rows()["landed"] == Landed.ON_GROUND).any())
 
 
 @pytest.mark.parametrize(

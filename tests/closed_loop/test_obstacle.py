@@ -17,7 +17,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, Mode, Phase
 from swarmctl.errors import ConfigError
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, evaluate
-from tests.closed_loop.conftest import AT_100_HZ, FINE, Flight, Fly, fly_now, mission_is_over
+from tests.closed_loop.conftest import AT_100_HZ, FINE, Flight, Fly, fly_now
 
 CONFIG, PUBLISHED = "improved_6_obstacle.toml", "thesis_6_obstacle.toml"
 
@@ -36,7 +36,7 @@ def clearance_m(flight: Flight) -> float:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_all_keep_clear_of_the_obstacle_and_of_each_other(fly: Fly, seed: int) -> None:
     """The worst of starts 1 to 3, shifted by a millimetre, are 1.763 m and 0.908 m."""
-    past = fly(FINE, "sitl.start=air", config=CONFIG, until=mission_is_over, seed=seed)
+    past = fly(FINE, "sitl.start=air", config=CONFIG, until=Lockstep.mission_is_over, seed=seed)
     assert clearance_m(past) >= 1.75
     assert past.separation_m() >= 0.89
     for agent in range(3):
@@ -62,7 +62,7 @@ def test_with_published_weights_all_stay_off_the_obstacle_and_land() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_with_published_weights_all_stay_off_the_obstacle_from_starts_a_millimetre_off(fly: Fly, seed: int) -> None:
-    check_published_weights(fly(FINE, "sitl.start=air", config=PUBLISHED, until=mission_is_over, seed=seed))
+    check_published_weights(fly(FINE, "sitl.start=air", config=PUBLISHED, until=Lockstep.mission_is_over, seed=seed))
 
 
 def test_the_obstacle_is_known_only_within_the_visibility_distance() -> None:

@@ -16,7 +16,7 @@ from swarmctl.control.controllers.guard import Guard
 from swarmctl.control.reference.kinds.goto import GotoParams
 from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import ConfigError
-from tests.closed_loop.conftest import AT_100_HZ, FINE, ROOT, Flight, closer_than, fly_now, mission_is_over
+from tests.closed_loop.conftest import AT_100_HZ, FINE, ROOT, Flight, closer_than, fly_now
 
 HEAD_ON = (
     AT_100_HZ,
@@ -39,11 +39,11 @@ def failures(flight: Flight, agent: int) -> list[str]:
 
 
 def is_over_and_at_rest(lockstep: Lockstep) -> bool:
-    return mission_is_over(lockstep) and bool(np.abs(lockstep.world.truth_rows()["vel_ned_m_s"]).max() < 0.2)
+    return lockstep.mission_is_over() and bool(np.abs(lockstep.world.truth_rows()["vel_ned_m_s"]).max() < 0.2)
 
 
 def test_a_controller_that_plans_through_a_peer_is_kept_from_it() -> None:
-    flight = fly_now(*HEAD_ON, named("Meddling"), until=mission_is_over)
+    flight = fly_now(*HEAD_ON, named("Meddling"), until=Lockstep.mission_is_over)
     assert flight.separation_m() >= 0.85
     assert flight.outcomes == {"completed"}
     for agent in range(2):
@@ -116,7 +116,7 @@ def test_every_example_flies(name: str, rmse_m: float, duration_s: int) -> None:
         f"mission.duration_s={duration_s}",
         *(() if name == "own_pid" else ("swarm.agents=1",)),
     )
-    flight = fly_now(*short, config=f"examples/{name}.toml", until=mission_is_over)
+    flight = fly_now(*short, config=f"examples/{name}.toml", until=Lockstep.mission_is_over)
     assert flight.outcomes == {"completed"}
     for agent in range(flight.config.swarm.agents):
         ticks, error = flight.tracked(agent)
@@ -136,14 +136,16 @@ SWAPPED = "mission.own.formations=[{slots_ned_m=[[2.0,1.0,-3.0],[2.0,-1.0,-3.0]]
 def test_a_formation_is_changed_by_the_assignment_of_least_squares() -> None:
     short = ("swarm.agents=2", "sitl.start=air", "mission.duration_s=4.5", "mission.own.stay_s=0.5")
     sets = (*short, "mission.own.change_s=3.0", SWAPPED)
-    flight = fly_now(*sets, config="examples/own_formation.toml", until=mission_is_over)
+    flight = fly_now(*sets, config="examples/own_formation.toml", until=Lockstep.mission_is_over)
     assert flight.outcomes == {"completed"}
     assert flight.separation_m() >= 1.9, "side by side"
     for agent, slot in enumerate(([2.0, -1.0, -3.0], [2.0, 1.0, -3.0])):
         ticks, _ = flight.tracked(agent)
         assert ticks["pos_ned_m"][-1] == pytest.approx(slot, abs=0.05)
     with pytest.raises(ConfigError, match=r"agents 0 and 1: at .* the references are"):
-        fly_now(*sets, "mission.own.assigned=false", config="examples/own_formation.toml", until=mission_is_over)
+        fly_now(
+            *sets, "mission.own.assigned=false", config="examples/own_formation.toml", until=Lockstep.mission_is_over
+        )
     with pytest.raises(ConfigError, match=r"agents 0 and 3: at 4\.54 s the references are 0\.85 m apart"):
         load(ROOT / "configs" / "examples/own_formation.toml", ["mission.own.assigned=false"])
 

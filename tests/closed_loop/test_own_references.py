@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sitl.lockstep import Lockstep
 from swarmctl.core.types import Mode, Phase
 from swarmctl.telemetry.evaluation.referee import evaluate
-from tests.closed_loop.conftest import FINE, Flight, Fly, fly_now, mission_is_over
+from tests.closed_loop.conftest import FINE, Flight, Fly, fly_now
 
 PERIOD_S, LENGTH_M, WIDTH_M = 12.0, 2.0, 1.0
 
@@ -43,7 +44,7 @@ def own(path: Path) -> tuple[str, ...]:
 
 @pytest.fixture(scope="module")
 def flown(figure_8: Path) -> Flight:
-    return fly_now(*own(figure_8), until=mission_is_over)
+    return fly_now(*own(figure_8), until=Lockstep.mission_is_over)
 
 
 def test_a_figure_8_from_a_file_is_flown(flown: Flight) -> None:
@@ -75,7 +76,7 @@ def test_the_reference_is_that_of_the_file(flown: Flight, figure_8: Path) -> Non
 def test_the_error_counts_from_the_file_while_an_operator_holds_and_on_the_way_back(fly: Fly, figure_8: Path) -> None:
     """An agent that is held follows a stop, then a way to where its mission is by now."""
     orders = {2.0: lambda it: it.command("hold"), 4.5: lambda it: it.command("resume")}
-    held = fly(*own(figure_8), at=orders, until=mission_is_over)
+    held = fly(*own(figure_8), at=orders, until=Lockstep.mission_is_over)
     rows = held.ticks(0)
     ticks = rows[(rows["phase"] == Phase.TRACK) & np.isfinite(rows["mission_t_s"])]
     written = written_ned_m(figure_8, ticks["mission_t_s"])
@@ -88,6 +89,6 @@ def test_the_error_counts_from_the_file_while_an_operator_holds_and_on_the_way_b
 
 
 def test_negative_control_a_controller_without_authority_does_not_fly_it(fly: Fly, figure_8: Path) -> None:
-    weak = fly(*own(figure_8), "controller.mpc.u_max=0.02", "mission.duration_s=5", until=mission_is_over)
+    weak = fly(*own(figure_8), "controller.mpc.u_max=0.02", "mission.duration_s=5", until=Lockstep.mission_is_over)
     ticks, error = weak.tracked(0)
     assert float(np.sqrt(np.mean(np.sum(error[ticks["mission_t_s"] > 2.0] ** 2, axis=1)))) > 0.2

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from swarmctl.core.types import Array, Phase, PlanStatus
-from tests.closed_loop.conftest import Flight, closer_than, mission_is_over
+from tests.closed_loop.conftest import Flight, closer_than
 
 CONFIG = Path(__file__).parents[2] / "configs" / "x500_circle.toml"
 WIND_NED_M_S = (3.6, 0.0, 0.0)
@@ -36,7 +36,7 @@ PLAIN = ("vehicle_model.attitude_rad_s=0", "vehicle_model.drag_1_s=0", "agent.st
 def fly(
     *overrides: str,
     wind_ned_m_s: tuple[float, float, float] | None = None,
-    until: Callable[[Lockstep], bool] = mission_is_over,
+    until: Callable[[Lockstep], bool] = Lockstep.mission_is_over,
 ) -> Lockstep:
     """Fly until the mission is over, or until another end."""
     flight = Lockstep(load(CONFIG, overrides))

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.closed_loop.conftest import FINE, Flight, Fly, fly_now, mission_is_over
+from sitl.lockstep import Lockstep
+from tests.closed_loop.conftest import FINE, Flight, Fly, fly_now
 
 DURATION_S = 10.0
 MISSION = (FINE, f"mission.duration_s={DURATION_S}", "sitl.start=air")
@@ -25,7 +26,7 @@ def osqp() -> Flight:
 
 @pytest.fixture(scope="module")
 def daqp() -> Flight:
-    return fly_now(*MISSION, DAQP, until=mission_is_over)
+    return fly_now(*MISSION, DAQP, until=Lockstep.mission_is_over)
 
 
 def apart_m(one: Flight, other: Flight) -> NDArray[np.float64]:
@@ -69,5 +70,5 @@ def test_positions_diverge_slowly(osqp: Flight, daqp: Flight) -> None:
 
 
 def test_negative_control_a_millimetre_at_the_start_parts_them_as_much(daqp: Flight, fly: Fly) -> None:
-    nudged = fly(*MISSION, DAQP, NUDGED, until=mission_is_over)
+    nudged = fly(*MISSION, DAQP, NUDGED, until=Lockstep.mission_is_over)
     assert apart_m(daqp, nudged).max() > 0.1  # measured 0.5; 1.1 by a millimetre the other way

@@ -9,7 +9,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.core.types import PlanStatus
-from tests.closed_loop.conftest import COARSE, FINE, Flight, Fly, mission_is_over, mission_t_s
+from tests.closed_loop.conftest import COARSE, FINE, Flight, Fly, mission_t_s
 
 SWAP = (FINE, "mission.duration_s=12", "sitl.start=air")  # from ten starts all agents arrive within 9.5 to 11.7 s
 
@@ -35,7 +35,7 @@ def check(flight: Flight) -> None:
 
 @pytest.mark.usefixtures("configured_starts")
 def test_eight_agents_swap_without_touching(fly: Fly) -> None:
-    flight = fly(*SWAP, config="swap8.toml", until=mission_is_over)
+    flight = fly(*SWAP, config="swap8.toml", until=Lockstep.mission_is_over)
     assert flight.outcomes == {"completed"}
     check(flight)
     for agent in range(8):
@@ -109,7 +109,7 @@ def four_arrive(fly: Fly, seed: int, *sets: str) -> float:
 def test_with_one_problem_for_three_axes_agents_come_to_rest(fly: Fly) -> None:
     """OSQP's tolerance for dual residuals follows the largest increments, which are z's: x-y needs a closer one."""
     sets = ("swarm.agents=4", "mission.kind=swap", "controller.kind=dmpc3", "mission.duration_s=14", "sitl.start=air")
-    flight = fly(*sets, "controller.mpc.qp.solver=osqp", until=mission_is_over)
+    flight = fly(*sets, "controller.mpc.qp.solver=osqp", until=Lockstep.mission_is_over)
     assert flight.separation_m() >= 0.85
     for agent in range(4):
         assert np.linalg.norm(flight.ticks(agent)["vel_ned_m_s"][-1]) < 0.03, "0.12 m/s with ten times the tolerance"

@@ -12,7 +12,7 @@ from swarmctl.config import Config, load
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.types import Mode, Phase
 from swarmctl.simulator_config import SimulatorConfig
-from tests.closed_loop.conftest import AT_100_HZ, Flight, mission_is_over
+from tests.closed_loop.conftest import AT_100_HZ, Flight
 
 CORNERS = "[[-2.5, -2.5], [2.5, -2.5], [2.5, 2.5], [-2.5, 2.5]]"
 VOLUME = (f"volume.corners_ne_m={CORNERS}", "volume.floor_z_m=1", "volume.ceiling_z_m=-3")
@@ -38,7 +38,7 @@ def too_wide(*overrides: str) -> Config:
 
 def flown(config: Config) -> Flight:
     lockstep = Lockstep(config)
-    lockstep.run(mission_is_over)
+    lockstep.run(Lockstep.mission_is_over)
     return Flight(lockstep)
 
 
@@ -68,7 +68,7 @@ def test_negative_control_agents_that_know_of_no_volume_leave_it() -> None:
     assert volume is not None
     flight = Lockstep(config.model_copy(update={"volume": VolumeParams()}))
     while float(volume.beyond_m(flight.world.truth_rows()["pos_ned_m"]).max()) < 0.5:
-        assert not mission_is_over(flight)
+        assert not flight.mission_is_over()
         flight.step()
 
 

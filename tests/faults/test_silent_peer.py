@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sitl.studies.campaign.conditions.layouts import nudged
 from swarmctl.agent.sensing import world_model
 from swarmctl.config import load
 from swarmctl.control.collision import separation
-from tests.closed_loop.conftest import nudged
 from tests.faults.matrix import ROWS
 from tests.faults.simulated import SimulatedRow
 

@@ -32,7 +32,7 @@ from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.solvers.qp import QpParams, installed_solvers
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
-from swarmctl.core.types import Array, Phase, Plan
+from swarmctl.core.types import Array, Plan
 
 Mask = NDArray[np.bool_]
 _OBSTACLE = "obstacles=[{center_ned_m=[-5.0,-1.5,-1.8],radius_m=1.0,keep_out_m=1.75,visibility_m=3.0}]"
@@ -100,7 +100,7 @@ def capture(config: Config, most: int = MOST_PROBLEMS) -> Captured:
         for agent, recording, kept in zip(agents, recordings, found, strict=True):
             kept += [(p, agent.timing.tick_ms) for p in recording.problems if len(p.keep_outs) == _MAX_KEEP_OUTS]
             recording.problems.clear()
-        return len(found[0]) >= most or all(log.rows[-1]["phase"][0] > Phase.TRACK for log in flown.logs)
+        return len(found[0]) >= most or flown.mission_is_over()
 
     with settled_garbage():
         flight.run(enough)

@@ -15,7 +15,7 @@ from sitl.plant.attitude import THESIS_SAMPLE_S
 from sitl.studies.thesis.trace import Array, Trace
 from swarmctl.config import Config
 from swarmctl.core.frames import euler_from_quat
-from swarmctl.core.types import Phase, PlanStatus
+from swarmctl.core.types import PlanStatus
 
 PHYSICS_HZ = round(1.0 / THESIS_SAMPLE_S)
 
@@ -28,8 +28,8 @@ def fly_over_mavlink(name: str, config: Config) -> Trace:
     """
     sitl = config.sitl.model_copy(update={"physics_hz": PHYSICS_HZ, "start": "air"})
     lockstep = Lockstep(config.model_copy(update={"sitl": sitl}))
-    lockstep.run(_mission_is_over)
-    if not _mission_is_over(lockstep):
+    lockstep.run(Lockstep.mission_is_over)  # how they land is no part of the trace
+    if not lockstep.mission_is_over():
         raise RuntimeError(f"{name}: the mission did not end")
     outcomes = [agent.outcome for agent in lockstep.agents if agent is not None]
     problems = [f"agent {i}: {outcome}" for i, outcome in enumerate(outcomes) if outcome != "completed"]
@@ -62,11 +62,6 @@ def fly_over_mavlink(name: str, config: Config) -> Trace:
         terminal_missed=None,
         obstacles=config.obstacles,
     )
-
-
-def _mission_is_over(lockstep: Lockstep) -> bool:
-    """Return whether no agent flies its mission any more: how they land is no part of the trace."""
-    return all(len(log.rows) and log.rows[-1]["phase"][0] > Phase.TRACK for log in lockstep.logs)
 
 
 def _euler(q_nb: Array) -> Array:

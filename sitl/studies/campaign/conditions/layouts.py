@@ -10,12 +10,21 @@ from swarmctl.core.types import Array
 
 _TRIES = 2000
 _RESTARTS = 200
+_NUDGE_M = 1e-3
 
 
 def ring(agents: int, radius_m: float, turn_rad: float) -> Array:
     """Return the corners (N, 3) of a regular polygon at z = 0, the first one at `turn_rad`."""
     angle = turn_rad + 2.0 * math.pi * np.arange(agents) / agents
     return np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), np.zeros(agents)], axis=1)
+
+
+def nudged(starts_ned_m: Array, seed: int) -> Array:
+    """Return places (N, 3) shifted by up to a millimetre in the plane; seed 0 leaves them unchanged."""
+    offsets = np.zeros(starts_ned_m.shape)
+    if seed:
+        offsets[:, :2] = np.random.default_rng(seed).uniform(-_NUDGE_M, _NUDGE_M, (len(starts_ned_m), 2))
+    return starts_ned_m + offsets
 
 
 def scattered(rng: np.random.Generator, count: int, low_m: Array, high_m: Array, *, apart_m: float) -> Array:
