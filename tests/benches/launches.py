@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -46,6 +48,15 @@ class Launched:
         command += ["--run-dir", str(run_dir)]
         with self.out.open("w") as out:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=self.env, cwd=ROOT)
+
+    def clean_up(self) -> None:
+        """Kill what is left of it, and remove its temporary files."""
+        for relative in self.relatives():
+            with contextlib.suppress(psutil.Error):
+                relative.kill()
+        self.process.kill()
+        self.process.wait(20)
+        shutil.rmtree(self.temp, ignore_errors=True)
 
     def text(self) -> str:
         return self.out.read_text()

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 
 from tests.benches.launches import Launched, Start
@@ -28,9 +25,4 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
     yield starter
     for launched in launches:
-        for relative in launched.relatives():
-            with contextlib.suppress(psutil.Error):
-                relative.kill()
-        launched.process.kill()
-        launched.process.wait(20)
-        shutil.rmtree(launched.temp, ignore_errors=True)
+        launched.clean_up()

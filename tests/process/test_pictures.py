@@ -19,13 +19,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from swarmctl.config import Config, dump
 from swarmctl.telemetry.palette import agent_rgb
 from swarmctl.telemetry.recording.run_files import load_run
-from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
 from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
 from swarmctl.telemetry.view.recordings import simulated_recording
-from tests.unit.telemetry.test_run_folder import write_run
+from tests.benches.recorded_runs import write_configured_run
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(300)]
 
@@ -40,9 +38,7 @@ ASKED = os.environ.get("SWARMCTL_PICTURES") == "1"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a finished run of three agents."""
     directory = tmp_path_factory.mktemp("run")
-    write_run(directory, 3, 6.0)
-    (directory / "config.toml").write_text(dump(Config()))
-    finish_run(directory, Config().rules(), Outcome(outcome="completed"))
+    write_configured_run(directory, 3, 6.0)
     return directory
 
 

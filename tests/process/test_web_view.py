@@ -14,14 +14,12 @@ from urllib.parse import parse_qs, urlsplit
 import psutil
 import pytest
 
-from swarmctl.config import Config, dump
 from swarmctl.errors import StartError
 from swarmctl.telemetry.recording.run_files import load_run
-from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
 from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
 from swarmctl.telemetry.view.recordings import simulated_recording
 from swarmctl.telemetry.view.web_page import web_page
-from tests.unit.telemetry.test_run_folder import write_run
+from tests.benches.recorded_runs import write_configured_run
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(120)]
 
@@ -30,9 +28,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(120)]
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a finished run of two agents, with its recording."""
     directory = tmp_path_factory.mktemp("run")
-    write_run(directory, 2, 2.0)
-    (directory / "config.toml").write_text(dump(Config()))
-    finish_run(directory, Config().rules(), Outcome(outcome="completed"))
+    write_configured_run(directory, 2, 2.0)
     simulated_recording(directory, load_run(directory), ViewedFlight(agents=(AgentBounds(),) * 2))
     return directory
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 
 from tests.benches.launches import Launched
@@ -42,12 +40,7 @@ class Field:
 
     def close(self) -> None:
         for launched in self._launches:
-            for relative in launched.relatives():
-                with contextlib.suppress(psutil.Error):
-                    relative.kill()
-            launched.process.kill()
-            launched.process.wait(20)
-            shutil.rmtree(launched.temp, ignore_errors=True)
+            launched.clean_up()
         self.witness.close()
         self.fleet.close()
 

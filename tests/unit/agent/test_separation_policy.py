@@ -9,22 +9,19 @@ import pytest
 
 from swarmctl.agent.components import SEPARATION_MODES
 from swarmctl.agent.planning.separation_policy import BestEffort, Guaranteed, SeparationInputs, SeparationPolicy
-from swarmctl.bus.local.hub import LocalBus
 from swarmctl.control.collision.separation import KeepOuts, SeparationParams
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.core.types import Phase
 from tests import builders
-from tests.unit.agent.test_coordination import HERE, PLACE, Bench
+from tests.benches.agent_and_peer import HERE, PLACE, Bench
 
 YAW_RAD = 0.3
 KEEP_OUT = builders.keep_out(pos_ned_m=np.tile(PLACE, (3, 1)))
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
-    made = Bench()
-    monkeypatch.setattr(LocalBus, "alive", lambda self: frozenset(made.alive))
-    return made
+def bench() -> Bench:
+    return Bench()
 
 
 def inputs(bench: Bench) -> SeparationInputs:

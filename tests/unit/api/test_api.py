@@ -24,19 +24,11 @@ from swarmctl.errors import ConfigError
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
 from tests.unit.ops.test_cli import HEAVY
 from tests.unit.telemetry.test_hostile_run_folder import REFUSED
-from tests.unit.telemetry.test_run_folder import write_finished_run
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("run")
-    write_finished_run(directory)
-    return directory
 
 
 @pytest.fixture
-def folder(finished: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(finished, tmp_path / "run"))
+def folder(finished_run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
 def test_importing_the_package_imports_nothing_heavy_and_has_every_name() -> None:
@@ -68,10 +60,10 @@ def test_values_are_set_as_python_has_them() -> None:
         swarmctl.load("nowhere.toml")
 
 
-def test_a_run_has_names_and_units(finished: Path) -> None:
-    run = swarmctl.load_run(str(finished))
+def test_a_run_has_names_and_units(finished_run: Path) -> None:
+    run = swarmctl.load_run(str(finished_run))
     assert (run.agents, run.outcome, run.violations) == ((0, 1, 2), "completed", [])
-    assert run.summary == json.loads((finished / "summary.json").read_text())
+    assert run.summary == json.loads((finished_run / "summary.json").read_text())
     assert run.config == Config()
     ticks, rows = run.ticks(1), run.tick_rows(1)
     assert ticks["phase"].to_pylist() == [Phase(number).name for number in rows["phase"]]

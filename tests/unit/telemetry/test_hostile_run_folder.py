@@ -22,21 +22,12 @@ from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.errors import ConfigError
 from swarmctl.ops.flight.summary import rewrite_report
 from swarmctl.telemetry.recording.run_folder import create_run_folder
-from tests.unit.telemetry.test_run_folder import write_finished_run
-
-
-@pytest.fixture(scope="module")
-def unspoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of three agents without faults."""
-    directory = tmp_path_factory.mktemp("run")
-    write_finished_run(directory)
-    return directory
 
 
 @pytest.fixture
-def folder(unspoilt: Path, tmp_path: Path) -> Path:
-    """A copy of it to spoil."""
-    return Path(shutil.copytree(unspoilt, tmp_path / "run"))
+def folder(finished_run: Path, tmp_path: Path) -> Path:
+    """A copy of a finished run to spoil."""
+    return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
 def report(directory: Path) -> subprocess.CompletedProcess[str]:

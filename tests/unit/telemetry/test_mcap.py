@@ -28,7 +28,7 @@ from swarmctl.ops.export import export_mcap
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_folder import Outcome, compare_runs, finish_run
 from swarmctl.telemetry.view.recordings import viewer_binary
-from tests.unit.telemetry.test_run_folder import UTC_US, write_run
+from tests.benches.recorded_runs import UTC_US, write_run
 
 MOVING = Obstacle(center_ned_m=(1.0, 2.0, -3.0), vel_ned_m_s=(0.5, 0.0, 0.0))
 COLUMN = Obstacle(center_ned_m=(4.0, 0.0, 0.0), column=True)

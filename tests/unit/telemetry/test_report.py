@@ -31,7 +31,7 @@ from swarmctl.telemetry.report.event_table import event_rows
 from swarmctl.telemetry.report.from_above import Place, top_view
 from swarmctl.telemetry.report.run_charts import RunCharts
 from swarmctl.telemetry.report.thinning import shape_of
-from tests.unit.telemetry.test_run_folder import UTC_US, flight, write_run
+from tests.benches.recorded_runs import UTC_US, flight, write_run
 
 SVG = "{http://www.w3.org/2000/svg}"
 

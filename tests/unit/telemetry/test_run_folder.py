@@ -6,13 +6,11 @@ import json
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from numpy.typing import NDArray
 
 from swarmctl import __version__
 from swarmctl.bus.messages.json_messages import first_list
@@ -23,64 +21,13 @@ from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import ControlMode, FlightMode, Mode, Phase, PlanStatus
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import hold
-from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
+from swarmctl.telemetry.evaluation.referee import Rules
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run, write_config
 from swarmctl.telemetry.report.thinning import thin
-
-UTC_US = 1_780_000_000_000_000
-
-
-def flight(agent: int, agents: int, seconds: float) -> tuple[NDArray[np.void], NDArray[np.void]]:
-    """Return ticks and truth of one agent on a circle, with take-off and landing."""
-    t_s = np.arange(0, seconds, 0.02)
-    rows, true = np.zeros(len(t_s), TICK_DTYPE), np.zeros(len(t_s), TRUTH_DTYPE)
-    rows["t_us"] = true["t_us"] = 5_000_000 + (t_s * 1e6).astype(np.int64)
-    rows["utc_us"] = rows["t_us"] + UTC_US
-    rows["seq"] = np.arange(len(t_s))
-    rows["phase"] = np.select([t_s < 1, t_s < 3, t_s < seconds - 1], [Phase.STANDBY, Phase.TAKEOFF, Phase.TRACK], 8)
-    rows["mode"] = np.where(rows["phase"] == Phase.TRACK, Mode.TRACKING, Mode.IDLE)
-    rows["control"] = np.where(rows["phase"] == Phase.TRACK, ControlMode.TRACKING, ControlMode.AUTO)
-    rows["mission_t_s"] = np.where(rows["phase"] == Phase.TRACK, t_s - 3, np.nan)
-    rows["armed"] = true["armed"] = t_s >= 1
-    angle = 0.5 * t_s
-    rows["ref_pos_ned_m"] = np.column_stack([5 * np.cos(angle), 5 * np.sin(angle), -1 - 0.1 * t_s])
-    around = 2 * np.pi * agent / agents
-    offset = 0.2 * agents * np.array([np.cos(around), np.sin(around), 0.0])
-    rows["pos_ned_m"] = true["pos_ned_m"] = rows["ref_pos_ned_m"] + offset
-    rows["q_nb"][:, 0] = true["q_nb"][:, 0] = 1.0
-    rows["setpoint_q_nb"] = np.where(rows["mode"][:, None] == Mode.IDLE, np.nan, rows["q_nb"])
-    noise = np.random.default_rng([1, agent]).gamma(2.0, 0.5, (2, len(t_s)))
-    rows["solve_ms"], rows["tick_ms"], rows["iterations"] = 1 + noise[0], 2 + noise[1], 25
-    rows["setpoint_thrust_01"], rows["hover_thrust_01"] = 0.5 + 0.02 * noise[0], 0.5
-    rows["plan_staleness_ms"] = np.nan
-    true["vehicle"] = agent
-    return rows, true
-
-
-def write_run(directory: Path, agents: int, seconds: float) -> None:
-    """Write the files that processes leave before the launcher finishes the run."""
-    true = []
-    for agent in range(agents):
-        rows, own = flight(agent, agents, seconds)
-        rows.tofile(directory / f"agent-{agent}.ticks")
-        true.append(own)
-        event = {"utc_us": UTC_US + agent, "t_us": agent, "source": f"agent-{agent}", "event": "phase", "to": "<b>"}
-        (directory / f"agent-{agent}.events.jsonl").write_text(json.dumps(event) + "\n")
-    np.concatenate(true).tofile(directory / "truth.bin")
-    (directory / "config.toml").write_text('name = "x<y"\n')
-
-
-def write_finished_run(directory: Path) -> None:
-    """Write a finished run of three agents without faults."""
-    write_run(directory, 3, 6.0)
-    (directory / "config.toml").write_text(dump(Config()))
-    finish_run(directory, RULES, Outcome(outcome="completed"))
-
-
-FAR_BALL = JudgedObstacle(number=0, obstacle=Obstacle(center_ned_m=(20.0, 20.0, -2.0)))
-RULES = Rules(agents=3, required_separation_m=0.85, obstacles=(FAR_BALL,))
+from tests.benches.pages import parsed
+from tests.benches.recorded_runs import FAR_BALL, RULES, UTC_US, flight, write_run
 
 
 def test_obstacles_that_an_operator_has_set_are_judged_and_drawn_also_later(tmp_path: Path) -> None:
@@ -310,33 +257,6 @@ def test_report_of_a_run_whose_launcher_died_says_so(tmp_path: Path) -> None:
     assert summary["violations"] == ["the launcher did not finish this run"]
 
 
-class _Page(HTMLParser):
-    """Collects the elements that a report must and must not contain."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[str] = []
-        self.addresses: list[str] = []
-        self.text = ""
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")]
-        if tag not in ("meta", "path", "rect", "circle", "i"):
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag not in ("i", "rect"):
-            assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-
 @pytest.mark.parametrize(("agents", "seconds"), [(3, 60.0), (12, 40.0), (1, 3.5)])
 def test_report_is_small_well_formed_and_self_contained(tmp_path: Path, agents: int, seconds: float) -> None:
     write_run(tmp_path, agents, seconds)
@@ -347,11 +267,9 @@ def test_report_is_small_well_formed_and_self_contained(tmp_path: Path, agents: 
     )
     finish_run(tmp_path, rules, Outcome(outcome="completed", problems=("one <script>alert(1)</script> problem",)))
     text = (tmp_path / "report.html").read_text()
-    page = _Page()
-    page.feed(text)
-    assert not page.open
+    page = parsed(text)
     assert len(text) < 1_000_000
-    assert page.addresses == []
+    assert page.addresses() == []
     assert "url(" not in text
     assert "script" not in page.tags
     assert "nan" not in text.lower().replace("covenant", "")

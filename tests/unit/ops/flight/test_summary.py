@@ -14,7 +14,7 @@ from swarmctl.errors import StartError
 from swarmctl.ops.flight.summary import rewrite_report
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch, process_start_s
 from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
-from tests.unit.telemetry.test_run_folder import RULES, write_run
+from tests.benches.recorded_runs import RULES, write_run
 
 # What the launcher does after all agents have landed; `limit` is the largest file the system lets it write.
 _SUM_UP = """
