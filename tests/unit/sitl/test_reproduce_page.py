@@ -211,8 +211,16 @@ def test_an_unknown_flight_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("flight", ["open_loop", "mpc_fast", "circle", "obstacle"])
 def test_a_flight_that_never_began_is_drawn_empty(tmp_path: Path, flight: FlightName) -> None:
-    text = write_page(tmp_path, [], {flight: [line_trace("never", flight, seconds=0.0)]}).read_text(encoding="utf-8")
-    parsed(text)
+    """The axes of its charts are there, and no curve; one of a flight that began has some."""
+    drawn = []
+    for name, seconds in (("never", 0.0), ("flown", 2.0)):
+        page = write_page(tmp_path, [], {flight: [line_trace(name, flight, seconds=seconds)]})
+        text = page.read_text(encoding="utf-8")
+        assert 'class="grid"' in text
+        assert parsed(text).tags.count("svg") >= 8
+        drawn.append(len(re.findall(r"<path[^>]* stroke=", text)))
+    assert drawn[0] == 0
+    assert drawn[1] > 0
 
 
 def test_torques_the_full_mavlink_loop_does_not_have() -> None:
