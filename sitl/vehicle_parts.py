@@ -1,4 +1,4 @@
-"""What every autopilot commands, and the interfaces of it and of its MAVLink side, as `SitlWorld` uses them."""
+"""What every autopilot commands, what it is built for, and the interfaces of it and its MAVLink side to `SitlWorld`."""
 
 from __future__ import annotations
 
