@@ -13,6 +13,7 @@ from swarmctl.bus import topics
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.constant_velocity import (
     StopJudge,
+    predict_after_setpoints,
     predict_constant_velocity,
     predict_without_setpoints,
 )
@@ -20,6 +21,7 @@ from swarmctl.control.estimation.gust import GustWatch
 from swarmctl.core.trajectory import grid
 from swarmctl.core.types import MAX_MARGIN_M, Array, FlightMode, Plan, PredictedPath, VehicleState
 
+_DOUBT_US = 600_000  # ahead, over which two ways of a vehicle are compared: they part by metres, and are told anew
 _COMMITTED_EVERY_US = 60_000  # peers compare such paths while they are newer than 0.3 s: one in five suffices
 
 
@@ -47,6 +49,7 @@ class PathPublisher:
         self._sharing = PathSharing(setup.params.path_sharing, setup.separation)
         self._gust, self._stop_judge = GustWatch(), StopJudge()
         self._published_us, self._margin_m = -_COMMITTED_EVERY_US, 0.0
+        self._flown: tuple[Plan, int] | None = None  # newest plan that was flown, and when its last setpoint acts
         self._far = FarPaths(setup.params.path_sharing)
 
     def publish(
@@ -106,18 +109,18 @@ class PathPublisher:
     def _path(self, state: VehicleState, flown: Plan | None, seq: int, margin_m: float) -> PredictedPath:
         if flown is not None:
             self._stop_judge.forget()
+            self._flown = flown, self._ports.clock.now_us() + self._delay_us
             t0_us, dt_us, pos = flown.t0_us, flown.dt_us, flown.pos_ned_m
         else:
             now_us = self._ports.clock.now_us()
             t0_us, dt_us = now_us + self._delay_us, self._dt_us
-            ahead_s = grid(self._steps) * (dt_us * 1e-6) + (t0_us - state.t_us) * 1e-6
             if self._is_recent(state):
-                stops = self._stop_judge.update(state)
+                stops, ahead_s = self._stop_judge.update(state), self._ahead_s(t0_us, state.t_us)
                 pos = predict_constant_velocity(state, ahead_s, self._setup.separation.brake_m_s2, stops=stops)
             else:
-                pos = self._without_link(state, ahead_s)
+                pos, apart_m = self._without_link(state, t0_us)
                 age_s = (now_us - state.t_us) * 1e-6  # as much as peers keep from a path of this age:
-                margin_m += self._setup.separation.budget.age_margin_m(age_s, parked=False)
+                margin_m += apart_m + self._setup.separation.budget.age_margin_m(age_s, parked=False)
         return PredictedPath(
             agent=self._setup.agent,
             boot_id=self._setup.boot_id,
@@ -128,9 +131,24 @@ class PathPublisher:
             pos_ned_m=pos,
         )
 
-    def _without_link(self, state: VehicleState, ahead_s: Array) -> Array:
-        """Return positions (N, 3), NED [m], at `ahead_s` (N,) after the last state of a vehicle that `_coasts`."""
+    def _without_link(self, state: VehicleState, t0_us: int) -> tuple[Array, float]:
+        """Return positions (N, 3), NED [m], from `t0_us` on of a vehicle that `_coasts`, and how far it may be off [m].
+
+        It keeps the attitude of the last setpoint that it has heard. In which direction the link has failed is not
+        known: that may be the one of its last state, or the last one that was sent. The middle of both ways is
+        returned, and what is between them while the attitude is kept.
+        """
         keeps_s, coasts_s = self._ports.autopilot.setpoint_loss_s, self._ports.autopilot.landing_delay_s
         assert keeps_s is not None and coasts_s is not None
-        brake_m_s2 = self._setup.separation.brake_m_s2
-        return predict_without_setpoints(state, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)
+        limits = {"keeps_s": keeps_s, "coasts_s": coasts_s, "brake_m_s2": self._setup.separation.brake_m_s2}
+        deaf = predict_without_setpoints(state, self._ahead_s(t0_us, state.t_us), **limits)
+        if self._flown is None or self._flown[1] <= state.t_us:
+            return deaf, 0.0
+        plan, last_us = self._flown
+        half = 0.5 * (predict_after_setpoints(plan, last_us, self._ahead_s(t0_us, last_us), **limits) - deaf)
+        soon = half[: 1 + round(_DOUBT_US / self._dt_us)]
+        return deaf + half, math.sqrt(float((soon * soon).sum(axis=1).max()))
+
+    def _ahead_s(self, t0_us: int, since_us: int) -> Array:
+        """Return the times (N,) [s] of a path from `t0_us` on, counted from another time."""
+        return grid(self._steps) * (self._dt_us * 1e-6) + (t0_us - since_us) * 1e-6

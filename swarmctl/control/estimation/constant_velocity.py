@@ -9,7 +9,7 @@ import numpy as np
 
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.trajectory import braking_displacement
-from swarmctl.core.types import Array, FlightMode, VehicleState
+from swarmctl.core.types import Array, FlightMode, Plan, VehicleState
 
 CREEP_M_S = 0.5  # a slower vehicle in hold is taken to rest: estimates of hovering ones wander as fast
 _ENTERS_US = 1_000_000  # time in hold for which it is taken to brake, whatever its speed does
@@ -38,14 +38,42 @@ def predict_without_setpoints(
     Its autopilot keeps the attitude for `keeps_s`, which accelerates it in the plane, levels and coasts on until
     `coasts_s`, and then brakes and lands.
     """
-    keeps_s, tilt_ned = min(keeps_s, coasts_s), body_z_ned(state.q_nb)
+    tilt_ned = body_z_ned(state.q_nb)
     accel_ned_m_s2 = np.append(-GRAVITY_M_S2 / max(_LEAST_COS, tilt_ned[2]) * tilt_ned[:2], 0.0)
+    motion = (state.pos_ned_m, state.vel_ned_m_s, accel_ned_m_s2)
+    return _kept(motion, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)
+
+
+def predict_after_setpoints(
+    plan: Plan, last_us: int, ahead_s: Array, *, keeps_s: float, coasts_s: float, brake_m_s2: float
+) -> Array:
+    """Return positions (N, 3), NED [m], at `ahead_s` (N,) after the last setpoint of a plan has acted, at `last_us`.
+
+    As `predict_without_setpoints`, of a vehicle that has followed the plan until then.
+    """
+    step = min(max(0.0, (last_us - plan.t0_us) / plan.dt_us), len(plan.pos_ned_m) - 1.0)
+    begun = min(int(step), len(plan.pos_ned_m) - 2)
+    part_01 = step - begun
+    pos, next_pos = plan.pos_ned_m[begun : begun + 2]
+    vel, next_vel = plan.vel_ned_m_s[begun : begun + 2]
+    accel_ned_m_s2 = (next_vel - vel) / (plan.dt_us * 1e-6)
+    accel_ned_m_s2[2] = 0.0
+    motion = (pos + part_01 * (next_pos - pos), vel + part_01 * (next_vel - vel), accel_ned_m_s2)
+    return _kept(motion, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)
+
+
+def _kept(
+    motion: tuple[Array, Array, Array], ahead_s: Array, *, keeps_s: float, coasts_s: float, brake_m_s2: float
+) -> Array:
+    """Continue a position, velocity and acceleration, all (3,) NED: keep the acceleration, coast, and brake."""
+    pos_ned_m, vel_ned_m_s, accel_ned_m_s2 = motion
+    keeps_s = min(keeps_s, coasts_s)
     kept_s, later_s = np.minimum(ahead_s, keeps_s)[:, None], np.maximum(ahead_s - keeps_s, 0.0)
-    vel_ned_m_s = state.vel_ned_m_s + keeps_s * accel_ned_m_s2
+    coasting_ned_m_s = vel_ned_m_s + keeps_s * accel_ned_m_s2
     coasted_s = np.minimum(later_s, coasts_s - keeps_s)[:, None]
-    braked_ned_m = braking_displacement(vel_ned_m_s, ahead_s - coasts_s, brake_m_s2)
-    kept_ned_m = kept_s * state.vel_ned_m_s + 0.5 * kept_s**2 * accel_ned_m_s2
-    return np.asarray(state.pos_ned_m + kept_ned_m + coasted_s * vel_ned_m_s + braked_ned_m)
+    braked_ned_m = braking_displacement(coasting_ned_m_s, ahead_s - coasts_s, brake_m_s2)
+    kept_ned_m = kept_s * vel_ned_m_s + 0.5 * kept_s**2 * accel_ned_m_s2
+    return np.asarray(pos_ned_m + kept_ned_m + coasted_s * coasting_ned_m_s + braked_ned_m)
 
 
 class StopJudge:

@@ -10,11 +10,12 @@ import pytest
 
 from swarmctl.control.estimation.constant_velocity import (
     StopJudge,
+    predict_after_setpoints,
     predict_constant_velocity,
     predict_without_setpoints,
 )
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_euler
-from swarmctl.core.types import FlightMode
+from swarmctl.core.types import FlightMode, Plan, PlanStatus
 from tests import builders
 
 BRAKE_M_S2 = 2.0
@@ -55,6 +56,24 @@ def test_who_lands_before_it_levels_brakes_from_the_tilt_it_has() -> None:
     level = replace(STATE, mode=FlightMode.EXTERNAL)
     pos = predict_without_setpoints(level, AHEAD_S, keeps_s=1.0, coasts_s=0.5, brake_m_s2=BRAKE_M_S2)
     assert pos[[5, 30]] == pytest.approx(STATE.pos_ned_m + np.outer([1.0, 2.0], [1.0, 0.0, 0.0]))
+
+
+def test_who_has_followed_a_plan_keeps_the_acceleration_that_it_had_there() -> None:
+    """0.25 s into a plan that accelerates from rest at 2 m/s2 it flies 0.5 m/s."""
+    t_s = 0.1 * np.arange(6.0)[:, None]
+    north = np.array([1.0, 0.0, 0.0])
+    plan = Plan(
+        status=PlanStatus.OK,
+        t0_us=1_000_000,
+        dt_us=100_000,
+        pos_ned_m=t_s**2 * north,
+        vel_ned_m_s=2.0 * t_s * north,
+        virtual_control=np.zeros((5, 3)),
+    )
+    ahead_s = np.array([0.0, 1.0, 2.0])
+    pos = predict_after_setpoints(plan, 1_250_000, ahead_s, keeps_s=1.0, coasts_s=9.0, brake_m_s2=BRAKE_M_S2)
+    begun_m = 0.065  # half way between two points of the plan
+    assert pos == pytest.approx(np.outer([begun_m, begun_m + 1.5, begun_m + 4.0], north))
 
 
 def judged(mode: FlightMode, speeds_m_s: Sequence[float]) -> list[bool]:
