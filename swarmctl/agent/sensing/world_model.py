@@ -35,9 +35,7 @@ from swarmctl.core.types import FLOWN_BY_AGENT, Array, FlightMode, Landed, Phase
 
 _COMPANY_US = 10_000_000  # a peer whose last status is older has left
 _SILENT_US = 2_000_000  # ten statuses; who is heard within it has not ended
-_EXPECTED_US = (
-    160_000  # whose path is older may fly another one: paths are shared each 0.1 s or more often, see `heartbeat_s`
-)
+_EXPECTED_US = 160_000  # `heartbeat_s` and three ticks; whose path is older may fly another one
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 _STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
 _DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
