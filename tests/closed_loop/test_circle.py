@@ -115,14 +115,14 @@ def test_without_peers_the_reference_is_met(fly: Fly) -> None:
 def closing_in(fly: Fly, *sets: str) -> Flight:
     """Fly twelve agents from their starts to the circle."""
     sets = (FINE, "swarm.agents=12", "sitl.start=air", *sets)
-    return fly(*sets, until=lambda lockstep: mission_t_s(lockstep) >= 1.5, seed=1)
+    return fly(*sets, until=lambda lockstep: mission_t_s(lockstep) >= 1.5, seed=2)
 
 
 def test_twelve_agents_that_close_in_on_one_point_keep_their_distance(fly: Fly) -> None:
     """With peers on both sides, room to stop beyond the horizon costs distance within it, and plans are refused.
 
     Agents then coast on old plans and brake, each in another way. From starts 0 to 5 they keep 0.885 to 0.894 m;
-    without room for those who come closer 0.874 m, and with one attempt only 0.807 m.
+    without room for those who come closer 0.874 m, and with one attempt only 0.80 m at the least of six.
     """
     assert closing_in(fly).separation_m() >= 0.85
 
