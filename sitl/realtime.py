@@ -12,20 +12,20 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 from sitl.fault_socket import ControlSocket
 from sitl.world import SitlWorld
+from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.files import hold
 from swarmctl.mavlink.transport import bind_udp
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.telemetry.recording.recorder import RowFile
 from swarmctl.wall_clock import monotonic_us
 
 HOST = "127.0.0.1"
 STALL_US = 200_000
 TRUTH_US = 20_000
-FLUSH_US = 500_000
+FLUSH_US = 100_000  # of true states that a killed simulator has not written
 MAX_PORT = 65535
 CONTROL_US = 100_000
 GATE_US = 20_000
@@ -44,37 +44,45 @@ class LoopStatistics:
 
 
 class TruthFile:
-    """Appends raw `TRUTH_DTYPE` rows at 50 Hz, on disk within a second."""
+    """Appends raw `TRUTH_DTYPE` rows at 50 Hz, on disk within a second.
+
+    Attributes:
+        lost: rows that the disk has not taken.
+    """
 
     def __init__(self, path: Path) -> None:
         try:
-            self._file: BinaryIO = path.open("ab", buffering=1 << 16)
+            path.open("ab").close()
         except OSError as error:
             raise ConfigError("sitl", [f"truth = {path}: {error.strerror}; allowed: a writable file"]) from error
-        hold(self._file.fileno())  # a report must not pack and remove what is still written
+        self._file = RowFile(path, TRUTH_DTYPE.itemsize)
+        self._rows: list[bytes] = []
         self._next_us = self._flush_us = 0
-        self._broken: OSError | None = None
+
+    @property
+    def lost(self) -> int:
+        return self._file.lost
 
     def record(self, world: SitlWorld, now_us: int) -> None:
-        """Append one row per vehicle when due; a full disk ends the file, not the flight."""
-        if now_us < self._next_us or self._broken is not None:
+        """Append one row per vehicle when due; a full disk costs rows until there is room again, never the flight."""
+        if now_us < self._next_us:
             return
         self._next_us = now_us - now_us % TRUTH_US + TRUTH_US
-        try:
-            self._file.write(world.truth_rows().tobytes())
-            if now_us >= self._flush_us:
-                self._flush_us = now_us + FLUSH_US
-                self._file.flush()
-        except OSError as error:
-            self._broken = error
+        self._rows.extend(row.tobytes() for row in world.truth_rows())
+        if now_us >= self._flush_us:
+            self._flush_us = now_us + FLUSH_US
+            self._flush()
 
     def close(self) -> str:
         """Flush and close; return a complaint, or ""."""
-        try:
-            self._file.close()
-        except OSError as error:
-            self._broken = self._broken or error
-        return f"truth file: {self._broken}" if self._broken else ""
+        self._flush()
+        self._file.close()
+        return f"truth file: {self.lost} rows could not be written" if self.lost else ""
+
+    def _flush(self) -> None:
+        rows, self._rows = self._rows, []
+        if rows:
+            self._file.append(rows)
 
 
 class Gate:

@@ -55,8 +55,8 @@ import sitl.realtime as it
 record = it.TruthFile.record
 def raising(self, world, now_us):
     record(self, world, now_us)
-    if self._broken is not None:
-        raise self._broken
+    if self.lost:
+        raise OSError(28, "No space left on device")
 it.TruthFile.record = raising
 """
 ROWS = (

@@ -12,6 +12,7 @@ from swarmctl.telemetry.evaluation.attitude import tilt_rad
 from swarmctl.telemetry.evaluation.tracks import Tracks
 
 _OVER_RAD = 1.4  # no plan tilts as much
+_SAME_INSTANT_US = 200_000  # largest time between a tick and the position that counts for it
 _CONTACT_M = 0.03  # centres of vehicles that stand are at the ground's height
 
 
@@ -43,5 +44,6 @@ def crashes(
             continue
         instants = np.clip(np.searchsorted(tracks.t_us, times_us), 0, len(tracks.t_us) - 1)
         down = tracks.pos_ned_m[instants, agent, 2] > ground_z_m - _CONTACT_M
+        down &= np.abs(tracks.t_us[instants] - times_us) < _SAME_INSTANT_US
         if down.any():
             yield f"agent {agent} touched the ground in flight, at {at_s(float(times_us[np.argmax(down)])):.1f} s"

@@ -41,6 +41,7 @@ from swarmctl.telemetry.evaluation.tracks import (
     unseen_spans,
     utc_offset_us,
 )
+from swarmctl.telemetry.evaluation.unrecorded import unrecorded
 
 SUMMED_ERROR = "distances of all agents to their reference, added up; mean over the mission"  # what `index_m` is
 STEADY_AFTER_S = 10.0  # mission time from which `steady_rmse_m` and `index_after_10s_m` are computed
@@ -116,6 +117,9 @@ def evaluate(
     tracking, tracked_s = _evaluate_tracking(run, rules.agents)
     unseen = [] if len(run.truth) else [*clocked.problems(), *_unseen(clocked, rules.agents, clock)]
     refused = _shorten(list(refused_peers(run.events)))
+    if clocked.ahead_s is None:
+        lacking = unrecorded(run.ticks, run.truth, run.events, here=here, at_s=clock.at_s)
+        unseen += _shorten(list(lacking))
     configured = dict(enumerate(rules.goals_ned_m))
     goals_ned_m = {agent: configured.get(agent) for agent in here}
     ground_z_m = rules.ground_z_m if len(run.truth) else None

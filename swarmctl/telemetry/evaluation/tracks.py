@@ -151,6 +151,12 @@ def _located(rows: NDArray[np.void]) -> NDArray[np.bool_]:
     return located
 
 
+def located_states_us(rows: NDArray[np.void]) -> Array:
+    """Return the monotonic times of the states in ticks whose vehicle was heard."""
+    heard = rows[_located(rows) & (rows["state_age_ms"] <= _STALE_MS)]
+    return np.unique(heard["t_us"] - heard["state_age_ms"].astype(np.float64) * 1e3)
+
+
 def _reported_positions(rows: NDArray[np.void], time_field: str, at_us: NDArray[np.int64]) -> Array:
     """Return the reported positions (T, 3) at instants (T,); each report counts at the time of its state.
 

@@ -44,10 +44,10 @@ class Recorder:
     def __init__(self, directory: Path, agent: int) -> None:
         self._source = agent_name(agent)
         self._files = (
-            _RowFile(directory / ticks_file(agent), TICK_DTYPE.itemsize),
-            _RowFile(directory / frames_file(agent)),
-            _RowFile(directory / events_file(self._source)),
-            _RowFile(directory / plans_file(agent), PLAN_DTYPE.itemsize),
+            RowFile(directory / ticks_file(agent), TICK_DTYPE.itemsize),
+            RowFile(directory / frames_file(agent)),
+            RowFile(directory / events_file(self._source)),
+            RowFile(directory / plans_file(agent), PLAN_DTYPE.itemsize),
         )
         self._queue: deque[tuple[int, bytes]] = deque()
         self._refused = 0  # written by the tick's thread
@@ -114,8 +114,8 @@ def event_line(source: str, name: str, t_us: int, utc_us: int, fields: Mapping[s
     return to_json({"utc_us": utc_us, "t_us": t_us, "source": source, "event": name, **fields}).encode()
 
 
-class _RowFile:
-    """A file that grows by whole rows only and counts the rows that could not be written."""
+class RowFile:
+    """A file that grows by whole rows only and counts the rows that could not be written; it tries again later."""
 
     def __init__(self, path: Path, row_bytes: int = 1) -> None:
         self.lost = 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import socket
 import time
 from pathlib import Path
@@ -102,6 +104,28 @@ def test_a_full_disk_does_not_stop_the_flight() -> None:
         clock.advance(1_000_000)
         truth.record(world, clock.now_us())
     assert "truth file" in truth.close()
+
+
+def test_a_disk_that_was_full_for_a_while_is_written_to_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimClock()
+    vehicle_end, _ = pipe_pair(clock.now_us)
+    world = SitlWorld(SimulatorConfig(vehicles=1), [vehicle_end])
+    truth = realtime.TruthFile(tmp_path / "truth.bin")
+
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    for second in range(4):
+        with monkeypatch.context() as disk:
+            if second == 1:
+                disk.setattr(os, "write", full)
+            for _ in range(50):
+                clock.advance(realtime.TRUTH_US)
+                truth.record(world, clock.now_us())
+    assert "rows could not be written" in truth.close()
+    rows = np.fromfile(tmp_path / "truth.bin", TRUTH_DTYPE)
+    assert len(rows) + truth.lost == 200
+    assert 40 < truth.lost < 60
 
 
 def test_the_end_of_the_port_range_is_refused() -> None:
