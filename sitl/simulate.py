@@ -28,7 +28,7 @@ from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.file_names import RECORDING, TRUTH, events_file, ticks_file
 from swarmctl.telemetry.recording.run_files import load_run, read_plans
-from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, write_config
+from swarmctl.telemetry.recording.run_folder import OUTCOME, Outcome, create_run_folder, finish_run, write_config
 from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording, simulated_recording
 from swarmctl.wall_clock import utc_us
 
@@ -59,14 +59,16 @@ def simulate(config: Config, directory: Path) -> int:
                 log.event(name, log.clock.now_us(), log.clock.utc_us(), **fields)
     speed_factor = flight.clock.now_us() * 1e-6 / wall_s
     shown = () if stop.count else tuple(problems)
-    unwritten = _write_rows(flight, directory)
+    gone = _write_rows(flight, directory)
     finished = finish_run(
         directory,
         config.rules("lockstep"),
         Outcome(outcome=outcome, problems=shown, speed_factor=speed_factor),
         flight.recorded(),
     )
-    summary, unwritten = finished.summary, (*unwritten, *finished.unwritten)
+    summary, unwritten = finished.summary, (*gone, *finished.unwritten)
+    if gone:
+        (directory / OUTCOME).unlink(missing_ok=True)  # of what is left no report can say how it ended
     if not unwritten:
         _write_recording(config, directory)
     print_line = PlainLines(sys.stdout).print_line  # to a terminal that may have been closed
@@ -74,7 +76,7 @@ def simulate(config: Config, directory: Path) -> int:
         print_line(line)
     print_line(f"{speed_factor:.1f} x real time")
     if unwritten:
-        print_line(unwritten_line(directory, unwritten))
+        print_line(unwritten_line(directory, finished.unwritten, gone))
     if stop.count:
         return EXIT_INTERRUPTED
     return EXIT_OK if summary["outcome"] == "completed" and not unwritten else EXIT_MISSION

@@ -46,12 +46,16 @@ def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Ca
     return bool(summary.get("violations"))
 
 
-def unwritten_line(directory: Path, unwritten: Sequence[str]) -> str:
-    """Return the line that reports files the disk did not take."""
-    return (
-        f"not everything could be written to {directory}: {'; '.join(unwritten)}. "
-        f"Make room, then: swarmctl report {directory}"
+def unwritten_line(directory: Path, unwritten: Sequence[str], gone: Sequence[str] = ()) -> str:
+    """Return the line that reports files the disk did not take, and those of them that were in memory only: `gone`."""
+    named = "; ".join(dict.fromkeys((*gone, *unwritten)))
+    files = ", ".join(line.partition(":")[0] for line in gone)
+    advice = (
+        f"What of {files} was not written is lost: make room, and fly again"
+        if gone
+        else f"Make room, then: swarmctl report {directory}"
     )
+    return f"not everything could be written to {directory}: {named}. {advice}"
 
 
 def rewrite_report(directory: Path) -> Path:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
 
 from swarmctl.core.json_safe import to_json
 from swarmctl.core.recorded.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
+from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.files import is_held, replace_text, write_each
+from swarmctl.files import is_held, replace_bytes, replace_text, write_each
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
+from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.recording.file_names import (
     AGENT_FILE,
     CONFIG,
@@ -41,6 +46,9 @@ from swarmctl.telemetry.recording.run_files import (
 from swarmctl.telemetry.report.comparison import JudgedRun, write_comparison
 from swarmctl.telemetry.report.run_report import FIGURES, REPORT, write_figures, write_report
 
+OUTCOME = "outcome.json"  # how a run ended; there until everything is written
+_OUTCOME_BYTES = 4096
+_PROBLEM_CHARACTERS = 500  # of a problem that is kept in it
 _LAUNCHES_PER_SECOND = 1000
 _TAKEN = frozenset((EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING, REPORT, STUDY_ROWS))
 
@@ -91,7 +99,7 @@ def _claim(base: Path) -> Path:
 
 
 def write_config(directory: Path, text: str) -> None:
-    """Write the resolved configuration of a new run into its folder.
+    """Write the resolved configuration of a new run into its folder, and keep room there for how it ends.
 
     Raises:
         ConfigError: another configuration is there, which may be the user's own.
@@ -101,6 +109,7 @@ def write_config(directory: Path, text: str) -> None:
     if path.exists() and path.read_text(encoding="utf-8", errors="replace") != text:
         raise ConfigError(f"--run-dir {directory}", [f"holds another {CONFIG}. Choose a new folder or move that file"])
     replace_text(path, text)
+    replace_bytes(directory / OUTCOME, b" " * _OUTCOME_BYTES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,6 +120,12 @@ class Outcome:
     problems: tuple[str, ...] = ()  # problems in words; each becomes a violation
     speed_factor: float | None = None  # simulated seconds per wall second
     events: Sequence[Mapping[str, Any]] = field(default=())  # events of the launcher itself
+
+
+class _KeptOutcome(msgspec.Struct):
+    outcome: Annotated[str, msgspec.Meta(pattern="^(completed|failed|interrupted)$")]
+    problems: list[str]
+    speed_factor: float | None = None
 
 
 class Finished(NamedTuple):
@@ -146,11 +161,42 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
         **{path.name: partial(_pack_truth, path) for path in directory.glob(TRUTH)},
         REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules=rules),
     }
-    return Finished(summary, write_each(writers))
+    unwritten = write_each(writers)
+    if unwritten:
+        _keep_outcome(directory, outcome)
+    else:
+        (directory / OUTCOME).unlink(missing_ok=True)
+    return Finished(summary, unwritten)
+
+
+def _keep_outcome(directory: Path, outcome: Outcome) -> None:
+    """Write how a run ended into the room that was kept for it, which a full disk has still."""
+    problems, shown = [problem[:_PROBLEM_CHARACTERS] for problem in outcome.problems], len(outcome.problems)
+    while True:
+        told = [*problems[:shown], *([f"and {len(problems) - shown} more"] if shown < len(problems) else [])]
+        kept = _KeptOutcome(outcome=outcome.outcome, problems=told, speed_factor=outcome.speed_factor)
+        content = to_json(msgspec.to_builtins(kept)).encode()
+        if len(content) <= _OUTCOME_BYTES or not shown:
+            break
+        shown //= 2
+    with contextlib.suppress(OSError):
+        fd = os.open(directory / OUTCOME, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        with os.fdopen(fd, "wb") as file:
+            file.write(content.ljust(_OUTCOME_BYTES))
+
+
+def _kept_outcome(directory: Path) -> Outcome:
+    """Return how a run ended whose files the disk did not take; that it was cut off, where nothing is known of it."""
+    text = read_text(directory / OUTCOME).strip()
+    try:
+        kept = msgspec.json.decode(text, type=_KeptOutcome)
+    except (msgspec.MsgspecError, UnicodeEncodeError):
+        return Outcome(outcome="failed", problems=("the launcher did not finish this run",))
+    return Outcome(outcome=kept.outcome, problems=tuple(kept.problems), speed_factor=kept.speed_factor)
 
 
 def report_run(directory: Path, rules: Rules) -> Path:
-    """Write `report.html` again; a run that was never finished is finished first, as failed.
+    """Write `report.html` again; a run that was never finished is finished first, as failed where its end is not known.
 
     Raises:
         ConfigError: a file in the folder has not the expected content.
@@ -160,9 +206,9 @@ def report_run(directory: Path, rules: Rules) -> Path:
         raise ConfigError(str(directory), [f"holds a campaign or a sweep, whose page is {REPORT}, and no run"])
     if read_summary(directory) is None:
         _refuse_recorded(directory)
-        finished = finish_run(
-            directory, rules, Outcome(outcome="failed", problems=("the launcher did not finish this run",))
-        )
+        run, outcome = load_run(directory), _kept_outcome(directory)
+        problems = (*outcome.problems, *_cut_off(run, outcome))
+        finished = finish_run(directory, rules, replace(outcome, problems=problems), run)
         if finished.unwritten:
             raise StartError(f"{directory}: can't be written: {'; '.join(finished.unwritten)}")
         return directory / REPORT
@@ -171,6 +217,14 @@ def report_run(directory: Path, rules: Rules) -> Path:
         return write_report(directory, judged.run, judged.summary, judged.config_text, rules=judged.rules)
     except OSError as error:
         raise StartError(f"{directory / REPORT}: can't be written: {error.strerror or error}") from error
+
+
+def _cut_off(run: RunData, outcome: Outcome) -> Iterator[str]:
+    """Yield whose ticks end in flight although the run was completed: the disk was full from then on."""
+    for agent, rows in run.ticks.items() if outcome.outcome == "completed" else ():
+        if len(rows) and len(flight_rows(rows[-1:])):
+            phase = Phase(int(rows["phase"][-1])).name
+            yield f"the recording of agent {agent} ends in {phase}: the rest of its flight can't be judged"
 
 
 def refuse_as_output(output: Path, directory: Path, suffix: str) -> None:

@@ -23,7 +23,9 @@ def test_a_full_disk_costs_the_files_and_not_the_verdict(tmp_path: Path) -> None
     assert done.returncode == 4, done.stderr
     assert lines[0].startswith("completed, summed mean tracking error")
     assert lines[1].startswith("no other agent")
-    assert "agent-0.ticks: File too large" in lines[-1]
+    assert lines[-1].count("agent-0.ticks: File too large") == 1
+    assert "What of truth.bin, agent-0.ticks was not written is lost" in lines[-1]
+    assert "swarmctl report" not in lines[-1], "the rows were in memory"
 
 
 def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:

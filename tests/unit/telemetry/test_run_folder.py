@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from swarmctl.core.types import ControlMode, FlightMode, Mode, Phase, PlanStatus
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import hold
 from swarmctl.telemetry.evaluation.referee import Rules
+from swarmctl.telemetry.recording import run_folder
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run, write_config
@@ -255,6 +257,41 @@ def test_report_of_a_run_whose_launcher_died_says_so(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["outcome"] == "failed"
     assert summary["violations"] == ["the launcher did not finish this run"]
+
+
+def full_disk(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("problems", [(), ("agent-1 failed: battery",), tuple(f"problem {k} " * 30 for k in range(40))])
+def test_how_a_run_ended_is_known_once_there_is_room(
+    problems: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_config(tmp_path, "")
+    write_run(tmp_path, 3, 20.0)
+    for path in tmp_path.glob("agent-*.ticks"):
+        rows = np.fromfile(path, TICK_DTYPE)
+        rows["phase"][-1] = Phase.DONE
+        path.write_bytes(rows.tobytes())
+    outcome = Outcome(outcome="failed" if problems else "completed", problems=problems)
+    with monkeypatch.context() as disk:
+        for writer in ("replace_text", "write_parquet", "write_report"):
+            disk.setattr(run_folder, writer, full_disk)
+        assert finish_run(tmp_path, RULES, outcome).unwritten
+    report_run(tmp_path, RULES)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["outcome"] == outcome.outcome
+    assert summary["violations"][:1] == list(problems[:1])
+    assert not (tmp_path / run_folder.OUTCOME).exists()
+
+
+def test_a_completed_run_whose_recording_ends_in_flight_is_not_judged_to_its_end(tmp_path: Path) -> None:
+    write_config(tmp_path, "")
+    write_run(tmp_path, 3, 20.0)
+    (tmp_path / run_folder.OUTCOME).write_text('{"outcome": "completed", "problems": []}')
+    report_run(tmp_path, RULES)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert "the recording of agent 0 ends in LAND: the rest of its flight can't be judged" in summary["violations"]
 
 
 @pytest.mark.parametrize(("agents", "seconds"), [(3, 60.0), (12, 40.0), (1, 3.5)])
