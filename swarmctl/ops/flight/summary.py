@@ -16,6 +16,7 @@ from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 from swarmctl.telemetry.evaluation.station_clock import corrected_text
 
+_LATE_SHOWN = 5  # agents that are named because a station has not seen their beginning
 _MISSED_SHOWN = 5  # agents that are named because they have not reached their goals
 
 
@@ -98,7 +99,10 @@ def compare(directories: Sequence[Path], output: Path | None) -> Path:
 
 
 def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:
-    """Return five lines: outcome, separation, timing, solver and bus, folder; and one for each own controller."""
+    """Return five lines: outcome, separation, timing, solver and bus, folder.
+
+    One more says what a station has not seen, and one for each own controller how much it has flown.
+    """
     violations = summary.get("violations") or []
     obstacles = _section(summary, "obstacles")
     timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
@@ -117,6 +121,7 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         _separation(summary)
         + (f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else "")
         + _corrected(summary),
+        *_seen_late(summary),
         f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')} from arming on, "
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
@@ -149,6 +154,19 @@ def _separation(summary: Mapping[str, Any]) -> str:
 def _corrected(summary: Mapping[str, Any]) -> str:
     corrected = corrected_text(summary.get("clocks"))
     return f"; clocks corrected: {corrected}" if corrected else ""
+
+
+def _seen_late(summary: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return one line that says from when on a station that began late has seen whom; none if it has seen all."""
+    found = summary.get("seen_late") or ()
+    shown = found[:_LATE_SHOWN]
+    said = [f"agent {row['id']} from {_at(row['from_s'])} on, in {printable(row['phase'])}" for row in shown]
+    said += [f"{len(found) - _LATE_SHOWN} more"] if len(found) > _LATE_SHOWN else []
+    return (f"not seen from the start, and not judged before: {', '.join(said)}",) if said else ()
+
+
+def _at(at_s: float | None) -> str:
+    return "an unknown time" if at_s is None else f"{at_s:.1f} s"
 
 
 def _goals(found: Mapping[str, Any]) -> str:

@@ -31,7 +31,7 @@ from swarmctl.telemetry.evaluation.run_counts import (
     percentiles,
     solver_counts,
 )
-from swarmctl.telemetry.evaluation.station_clock import ClockedTicks, by_station_clock
+from swarmctl.telemetry.evaluation.station_clock import ClockedTicks, by_station_clock, seen_late
 from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
@@ -146,6 +146,7 @@ def evaluate(
         "solver": solver_counts(run.ticks, rules.solver_name, rules.solver_retry),
         "comms": communication(run.ticks, run.events, tracks.time_field),
         "clocks": clocked.summary(),
+        "seen_late": seen_late(clocked, clock.at_s),
         "deadlocks": deadlock_counts(run.events),
         "commitments": commitment_counts(run.events),
     }

@@ -8,7 +8,7 @@ as they do not step; that they drift apart, by up to a tenth of a second in an h
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.json_safe import finite
+from swarmctl.core.types import Phase
 
 SENDER_CLOCK = "sender_clock"  # event: the monotonic clock of `agent` is `behind_us` behind the station's, at most
 _WORTH_TELLING_S = 0.05  # smaller differences are corrected without a word
@@ -57,6 +58,28 @@ class ClockedTicks:
         if self.ahead_s is None:
             return None
         return [{"id": agent, "ahead_s": ahead_s} for agent, ahead_s in sorted(self.ahead_s.items())]
+
+
+def seen_late(clocked: ClockedTicks, at_s: Callable[[float], float]) -> list[dict[str, Any]] | None:
+    """Return the agents whose flight a station has not seen from its beginning on; None where there is no station.
+
+    Args:
+        clocked: ticks of a run.
+        at_s: returns the mission time of an instant of their UTC.
+    """
+    if clocked.ahead_s is None:
+        return None
+    firsts = [(agent, rows[0]) for agent, rows in sorted(clocked.ticks.items()) if len(rows)]
+    known = clocked.known
+    return [
+        {
+            "id": agent,
+            "phase": Phase(int(first["phase"])).name,
+            "from_s": at_s(float(first["utc_us"])) if agent in known else None,
+        }
+        for agent, first in firsts
+        if Phase.STANDBY < first["phase"] < Phase.DONE
+    ]
 
 
 def by_station_clock(ticks: Mapping[int, NDArray[np.void]], events: Sequence[Mapping[str, Any]]) -> ClockedTicks:

@@ -100,6 +100,12 @@ class _Clock(msgspec.Struct):
     ahead_s: Annotated[float, msgspec.Meta(ge=-1e14, le=1e14)] | None = None  # also of one that begins in 1970
 
 
+class _SeenLate(msgspec.Struct):
+    id: Annotated[int, msgspec.Meta(ge=0, lt=1000)]
+    phase: str
+    from_s: _Figure | None = None
+
+
 class _Summary(msgspec.Struct):
     outcome: Outcome
     violations: list[str]
@@ -117,6 +123,7 @@ class _Summary(msgspec.Struct):
     goals: _Goals | None = None
     own_controllers: list[_OwnController] = []
     clocks: list[_Clock] | None = None
+    seen_late: list[_SeenLate] | None = None
 
 
 def decode_summary(content: bytes) -> dict[str, Any]:

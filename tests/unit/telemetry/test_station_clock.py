@@ -15,12 +15,15 @@ from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.topics import OBSTACLES, STATUS, TICK
 from swarmctl.core.recorded.records import pack_tick
+from swarmctl.core.types import Phase
 from swarmctl.ops.flight.station import SwarmWatch
 from swarmctl.ops.flight.summary import summary_lines
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
 from swarmctl.telemetry.evaluation.station_clock import corrected_text
+from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.run_files import load_run
+from swarmctl.telemetry.recording.summary_file import decode_summary
 from swarmctl.telemetry.report.run_charts import RunCharts
 from swarmctl.telemetry.report.run_report import summary_rows
 from tests.unit.telemetry.test_referee import UTC0_US, run, ticks
@@ -114,6 +117,23 @@ def test_what_a_station_has_not_heard_is_not_laid_to_an_agent(tmp_path: Path) ->
     rows["state_age_ms"][100:150] = 20.0 * np.arange(50)
     (stale,) = [text for text in evaluate(run, RULES, "completed")["violations"] if text.startswith("agent 1")]
     assert "did not know where its armed vehicle was" in stale
+
+
+def test_a_station_that_began_late_says_from_when_it_has_seen_whom(tmp_path: Path) -> None:
+    whole = run_of_station(ticks(20, (2.0, 0.0, 0.0)), (0, 0), (1, 0))
+    for rows in whole.ticks.values():
+        rows["phase"][0] = Phase.STANDBY
+    summary = evaluate(whole, RULES, "completed")
+    assert summary["seen_late"] == []
+    assert not any("not seen from the start" in line for line in summary_lines(summary, tmp_path))
+    late = replace(whole, ticks={0: whole.ticks[0], 1: whole.ticks[1][250:]})
+    summary = evaluate(late, RULES, "completed")
+    assert summary["outcome"] == "completed", "the station is no judge of what was before"
+    assert summary["seen_late"] == [{"id": 1, "phase": "TRACK", "from_s": pytest.approx(5.0)}]
+    assert decode_summary(to_json(summary).encode())["seen_late"] == summary["seen_late"]
+    line = "not seen from the start, and not judged before: agent 1 from 5.0 s on, in TRACK"
+    assert line in summary_lines(summary, tmp_path)
+    assert evaluate(replace(late, events=[]), RULES, "completed")["seen_late"] is None
 
 
 def test_differences_as_small_as_a_delay_are_not_told() -> None:
