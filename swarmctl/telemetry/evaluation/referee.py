@@ -105,7 +105,7 @@ def evaluate(
         speed_factor: simulated seconds per wall second.
     """
     clocked = by_station_clock(run.ticks, run.events)
-    run, known = replace(run, ticks=clocked.ticks), clocked.known
+    run, known = replace(run, ticks=clocked.ticks, events=clocked.events(run.events)), clocked.known
     tracks = merge_tracks(known, run.truth, rules.agents)
     clock = _MissionClock(known, tracks)
     without = _flown_without(run.events)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.bus.bus import agent_name
 from swarmctl.core.json_safe import finite
 from swarmctl.core.types import Phase
 
@@ -37,6 +38,24 @@ class ClockedTicks:
 
     ticks: dict[int, NDArray[np.void]]
     ahead_s: dict[int, float | None] | None
+
+    def events(self, recorded: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Return events in order of time, those of agents with `utc_us` by the station's clock where it is known."""
+        ahead_us = {
+            agent_name(agent): round(ahead_s * 1e6)
+            for agent, ahead_s in (self.ahead_s or {}).items()
+            if ahead_s is not None
+        }
+        if not any(ahead_us.values()):
+            return [dict(event) for event in recorded]
+        events = []
+        for event in recorded:
+            shift_us, utc_us = ahead_us.get(str(event.get("source"))), event.get("utc_us")
+            if shift_us is not None and isinstance(utc_us, int):
+                events.append({**event, "utc_us": utc_us - shift_us})
+            else:
+                events.append(dict(event))
+        return sorted(events, key=lambda event: finite(event.get("utc_us")) or 0.0)
 
     @property
     def known(self) -> dict[int, NDArray[np.void]]:

@@ -77,7 +77,8 @@ def write_mcap(path: Path, recorded: RecordedFlight) -> None:
             "MCAP needs a library of its own. Install it, in the checkout: pip install '.[mcap]'"
         ) from error
     run = recorded.run
-    recorded = replace(recorded, run=replace(run, ticks=by_station_clock(run.ticks, run.events).ticks))
+    clocked = by_station_clock(run.ticks, run.events)
+    recorded = replace(recorded, run=replace(run, ticks=clocked.ticks, events=clocked.events(run.events)))
     context = foxglove.Context()
     with replaced(path) as file, foxglove.open_mcap(file, context=context) as writer:
         writer.write_metadata("swarmctl", {"version": __version__})

@@ -66,7 +66,8 @@ class RunCharts:
 
     def __init__(self, run: RunData, summary: Mapping[str, Any], rules: Rules | None) -> None:
         clocked = by_station_clock(run.ticks, run.events)
-        self._run = run = replace(run, ticks=clocked.ticks)
+        self._run = run = replace(run, ticks=clocked.ticks, events=clocked.events(run.events))
+        self.events = run.events  # those of agents by the station's clock
         self._summary = summary
         self._rules = rules
         agents = int(summary["agents"])

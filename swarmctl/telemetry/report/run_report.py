@@ -37,7 +37,7 @@ def write_report(
         rules: limits and obstacles to draw, in addition to those in `summary`.
     """
     charts, path = RunCharts(run, summary, rules), directory / REPORT
-    events = list(event_rows(run.events, charts.time_of))
+    events = list(event_rows(charts.events, charts.time_of))
     missions, tracked_s = charts.flown_missions()
     page = render(
         __package__,

@@ -84,7 +84,15 @@ class Scene:
         self._obstacles = (obstacles, t_us - round(elapsed_s * 1e6))
         draw_obstacles(self._stream, obstacles, t_us, elapsed_s, self._flight)
 
-    def ticks(self, agent: int, t_us: Times, rows: NDArray[np.void], plan_ned_m: Array | None = None) -> None:
+    def ticks(
+        self,
+        agent: int,
+        t_us: Times,
+        rows: NDArray[np.void],
+        plan_ned_m: Array | None = None,
+        *,
+        ahead_us: int = 0,
+    ) -> None:
         """Draw poses, trails and changes of state of an agent; its curves are drawn by `plots`.
 
         Args:
@@ -92,6 +100,7 @@ class Scene:
             t_us: time of each row on the shared timeline (T,), increasing.
             rows: `TICK_DTYPE` rows (T,).
             plan_ned_m: newest predicted path (M, 3), drawn at the last row; None to keep the old one.
+            ahead_us: how far these times are ahead of those of other agents, which counts for distances between them.
         """
         if not len(rows):
             return
@@ -100,7 +109,7 @@ class Scene:
             self.plans(agent, t_us[-1:], [plan_ned_m])
         self._pending.setdefault(agent, []).append((t_us, rows))
         self._states[agent].take(t_us, rows)
-        self._separation.offer(agent, t_us, rows["pos_ned_m"])
+        self._separation.offer(agent, t_us - ahead_us, rows["pos_ned_m"])
         self._newest[agent] = rows[-1]
         self._newest_us = max(self._newest_us, int(t_us[-1]))
 

@@ -24,7 +24,10 @@ class SeparationFeed:
         self._next_us: int | None = None
 
     def offer(self, agent: int, t_us: NDArray[np.int64], pos_ned_m: Array) -> None:
-        """Add positions (T, 3), NED, of one agent at `t_us` (T,), increasing."""
+        """Add positions (T, 3), NED, of an agent at `t_us` (T,), increasing; older ones than before are dropped."""
+        if len(self._t_us[agent]):  # a clock is better known than before
+            newer = t_us > self._t_us[agent][-1]
+            t_us, pos_ned_m = t_us[newer], pos_ned_m[newer]
         self._t_us[agent] = np.concatenate([self._t_us[agent], t_us])
         self._pos_ned_m[agent] = np.vstack([self._pos_ned_m[agent], pos_ned_m])
 

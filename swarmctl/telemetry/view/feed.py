@@ -5,7 +5,7 @@ The bus drops the oldest samples when the viewer is slow, so neither the bus nor
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,9 @@ from swarmctl.bus.messages.json_messages import ObstaclesMessage, decode_obstacl
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import unpack_tick
 from swarmctl.core.types import Array
+from swarmctl.wall_clock import utc_us
+
+_AS_LATE_US = 100_000  # what is late by less may be by the way, or have waited for the viewer
 
 
 class Batch(NamedTuple):
@@ -26,6 +29,7 @@ class Batch(NamedTuple):
     t_us: NDArray[np.int64]  # (T,) since the first sample of the swarm, increasing
     rows: NDArray[np.void]  # (T,) TICK_DTYPE
     plan_ned_m: Array  # (M, 3) of the newest row, empty when it had none
+    ahead_us: int  # how far the UTC of its computer is ahead of ours, by its arrivals; 0 where that may be their delay
 
 
 class Feed:
@@ -34,14 +38,15 @@ class Feed:
     Args:
         bus: connection that receives the topics of `listens_to(agents)`.
         agents: size of the swarm.
+        utc_us: clock of this computer.
 
     Attributes:
         received: tick records received so far.
         malformed: messages that could not be decoded so far.
     """
 
-    def __init__(self, bus: Bus, agents: int) -> None:
-        self._bus = bus
+    def __init__(self, bus: Bus, agents: int, utc_us: Callable[[], int] = utc_us) -> None:
+        self._bus, self._utc_us = bus, utc_us
         self._numbers = {agent_name(agent): agent for agent in range(agents)}
         self._listed: ObstaclesMessage | None = None
         self._clocks = [AgentClock() for _ in range(agents)]
@@ -82,8 +87,10 @@ class Feed:
 
     def _batch(self, agent: int, samples: list[tuple[NDArray[np.void], Array]]) -> list[Batch]:
         rows = np.concatenate([row for row, _ in samples])
-        t_us, kept = self._clocks[agent].place(rows, self._epoch_us or 0)
-        return [Batch(agent, t_us[kept], rows[kept], samples[-1][1])] if kept.any() else []
+        clock = self._clocks[agent]
+        t_us, kept = clock.place(rows, self._epoch_us or 0)
+        clock.arrived(int(t_us[-1]) + (self._epoch_us or 0), self._utc_us())
+        return [Batch(agent, t_us[kept], rows[kept], samples[-1][1], clock.ahead_us)] if kept.any() else []
 
 
 def listens_to(agents: int, launchers: Sequence[str] = (topics.OPERATOR,)) -> dict[topics.Topic, Sequence[str]]:
@@ -105,8 +112,20 @@ class AgentClock:
     def __init__(self) -> None:
         self.lost = 0
         self._offset_us: int | None = None
+        self._least_us: int | None = None  # of arrival and stamp
         self._last_us = -(1 << 62)
         self._last_seq = -1
+
+    @property
+    def ahead_us(self) -> int:
+        """How far these stamps are ahead of our UTC, at least; 0 for as little as messages may be late."""
+        behind_us = self._least_us or 0
+        return -behind_us if abs(behind_us) > _AS_LATE_US else 0
+
+    def arrived(self, utc_us: int, arrival_us: int) -> None:
+        """Take in the stamp of the newest tick, and our UTC by which it was there."""
+        behind_us = arrival_us - utc_us
+        self._least_us = behind_us if self._least_us is None else min(self._least_us, behind_us)
 
     def place(self, rows: NDArray[np.void], epoch_us: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the time (T,) of each row since `epoch_us` and a mask (T,) of rows newer than all before."""
@@ -115,7 +134,7 @@ class AgentClock:
         for k, row in enumerate(rows):
             seq = int(row["seq"])
             if self._offset_us is None or seq < self._last_seq:  # first sample, or the agent was started again
-                self._offset_us = int(row["utc_us"]) - int(row["t_us"])
+                self._offset_us, self._least_us = int(row["utc_us"]) - int(row["t_us"]), None
             elif seq > self._last_seq + 1:
                 self.lost += seq - self._last_seq - 1
             self._last_seq = seq

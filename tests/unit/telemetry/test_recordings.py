@@ -7,7 +7,7 @@ import struct
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from swarmctl import __version__
 from swarmctl.core.frames import euler_from_quat, quat_from_euler
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE, pack_tick
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import ControlMode, Mode, Phase
 from swarmctl.errors import StartError
@@ -26,7 +26,7 @@ from swarmctl.telemetry.palette import CONTROL_RGB, MODE_RGB, PHASE_RGB, agent_r
 from swarmctl.telemetry.scene.quad_mesh import quad_glb
 from swarmctl.telemetry.scene.separation_feed import SeparationFeed
 from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
-from swarmctl.telemetry.view.feed import AgentClock
+from swarmctl.telemetry.view.feed import AgentClock, Feed
 from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording, simulated_recording
 
 NO_TRUTH = np.zeros(0, TRUTH_DTYPE)
@@ -183,6 +183,36 @@ def test_clock_of_an_agent_ignores_utc_steps_counts_gaps_and_survives_a_restart(
     assert t_us.tolist() == [1010, 1030]
     assert newer.all()
     assert clock.lost == 2
+
+
+@pytest.mark.parametrize("ahead_us", [0, 500_000, -3_600_000_000])
+def test_live_distances_are_of_the_same_instants_whatever_clocks_say(ahead_us: int) -> None:
+    """Two vehicles fly the same line 1 m apart, at 2 m/s: by stamps 0.5 s apart they would meet."""
+    hub_us, sent = 1_000_000_000, list[tuple[str, bytes]]()
+
+    class Bus:
+        def receive(self, topic: object) -> list[tuple[str, bytes]]:
+            arrived = list(sent)
+            sent.clear()
+            return arrived
+
+    feed, separation, least_m = Feed(cast(Any, Bus()), 2, lambda: now_us), SeparationFeed(2), list[float]()
+    now_us = hub_us
+    for tick in range(500):
+        now_us = hub_us + 20_000 * tick
+        for agent in range(2):
+            row = np.zeros(1, TICK_DTYPE)
+            row["seq"], row["t_us"] = tick, 20_000 * tick
+            row["utc_us"] = now_us + agent * ahead_us
+            row["pos_ned_m"] = (2.0 * 0.02 * tick - agent, 0.0, 0.0)
+            sent.append((f"agent-{agent}", pack_tick(row, None)))
+        if tick % 5 == 0:
+            now_us += 3_000
+            for batch in feed.take():
+                separation.offer(batch.agent, batch.t_us - batch.ahead_us, batch.rows["pos_ned_m"])
+            least_m += separation.take()[1].tolist()
+    assert len(least_m) > 400
+    assert np.allclose(least_m, 1.0, atol=0.01)
 
 
 def test_roll_and_pitch_of_many_agree_with_those_of_one() -> None:

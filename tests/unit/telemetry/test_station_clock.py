@@ -119,6 +119,22 @@ def test_what_a_station_has_not_heard_is_not_laid_to_an_agent(tmp_path: Path) ->
     assert "did not know where its armed vehicle was" in stale
 
 
+def test_events_of_an_agent_are_judged_and_drawn_by_the_stations_clock(tmp_path: Path) -> None:
+    flown = crossing(2.0, 3600.0)
+    station = Station(tmp_path, flown)
+    first = [{"utc_us": int(rows["utc_us"][0]), "t_us": int(rows["t_us"][0])} for rows in flown]
+    lost = {**first[0], "source": "agent-0", "event": "unresponsive", "agent": 1, "begins": True}
+    late_us = first[1]["utc_us"] + 19_000_000
+    said = {**first[1], "utc_us": late_us, "source": "agent-1", "event": "operator", "verb": "hold"}
+    recorded = replace(station.run, events=[*station.run.events, lost, said])
+    summary = evaluate(recorded, RULES, "completed")
+    assert summary["comms"]["unresponsive"]["longest_s"] == pytest.approx(20.0, abs=1.5), "not an hour"
+    charts = RunCharts(recorded, summary, RULES)
+    (order,) = [event for event in charts.events if event["event"] == "operator"]
+    assert charts.time_of(order) == pytest.approx(19.0, abs=0.1)
+    assert said["utc_us"] == late_us, "what was recorded stays"
+
+
 def test_a_station_that_began_late_says_from_when_it_has_seen_whom(tmp_path: Path) -> None:
     whole = run_of_station(ticks(20, (2.0, 0.0, 0.0)), (0, 0), (1, 0))
     for rows in whole.ticks.values():
