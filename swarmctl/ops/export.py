@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from swarmctl.config import load_recorded
@@ -10,7 +9,7 @@ from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.discovery.own import OwnError
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.telemetry.export.mcap import RecordedFlight, write_mcap
-from swarmctl.telemetry.recording.run_files import read_plans
+from swarmctl.telemetry.recording.run_files import SUMMARY, read_plans, read_text
 from swarmctl.telemetry.recording.run_folder import read_judged, refuse_as_output
 
 
@@ -36,7 +35,7 @@ def export_mcap(directory: Path, output: Path | None) -> Path:
         flight=flight,
         obstacles=judged.rules.obstacles,
         config_toml=judged.config_text,
-        summary_json=json.dumps(judged.summary, indent=2),
+        summary_json=read_text(directory / SUMMARY),
     )
     try:
         write_mcap(path, recorded)

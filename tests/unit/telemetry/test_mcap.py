@@ -62,6 +62,13 @@ def test_a_file_of_the_run_is_not_written_over(folder: Path) -> None:
     assert (folder / "config.toml").read_bytes() == before
 
 
+def test_the_summary_is_attached_as_it_is(folder: Path, path: Path) -> None:
+    with path.open("rb") as file:
+        attached = {attachment.name: attachment.data for attachment in make_reader(file).iter_attachments()}
+    assert attached["summary.json"] == (folder / "summary.json").read_bytes()
+    assert "commitments" in json.loads(attached["summary.json"])
+
+
 def messages(path: Path, topic: str) -> list[tuple[int, Any]]:
     """Return the messages of a topic with their times [ns], decoded by the schemas that are in the file."""
     found = []
