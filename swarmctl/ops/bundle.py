@@ -73,7 +73,10 @@ def bundle(options: BundleOptions) -> Bundle:
         with ended_cleanly, tempfile.TemporaryDirectory(prefix="swarm-bundle-") as scratch:
             vehicles = _vehicles(config, options, Path(scratch))
             recorded = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.is_symlink()]
-            with replaced(output) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            with (
+                replaced(output) as file,
+                zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, strict_timestamps=False) as archive,  # before 1980
+            ):
                 archive.writestr("versions.json", _json(_versions()))
                 archive.writestr("vehicles.json", _json(vehicles))
                 for path in recorded:  # listed before the archive began, which may be among them

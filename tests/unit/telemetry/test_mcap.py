@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +62,13 @@ def test_a_file_of_the_run_is_not_written_over(folder: Path) -> None:
     with pytest.raises(ConfigError, match="is a file of the run"):
         compare_runs(folder / "config.toml", [(folder, Config().rules())] * 2)
     assert (folder / "config.toml").read_bytes() == before
+
+
+def test_a_file_dated_before_1980_is_bundled(folder: Path, tmp_path: Path) -> None:
+    """A computer without a battery for its clock begins in 1970."""
+    os.utime(folder / "events.jsonl", (0, 0))
+    written = bundle(BundleOptions(folder=folder, output=tmp_path / "run.zip")).path
+    assert f"{folder.name}/events.jsonl" in zipfile.ZipFile(written).namelist()
 
 
 def test_the_summary_is_attached_as_it_is(folder: Path, path: Path) -> None:
