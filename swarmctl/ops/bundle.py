@@ -81,7 +81,7 @@ def bundle(options: BundleOptions) -> Bundle:
                 archive.writestr("vehicles.json", _json(vehicles))
                 for path in recorded:  # listed before the archive began, which may be among them
                     if path != output.resolve():
-                        archive.write(path, Path(folder.name) / path.relative_to(folder))
+                        _add(archive, path, Path(folder.name) / path.relative_to(folder))
                 for path in sorted(Path(scratch).iterdir()):
                     archive.write(path, Path("logs") / path.name)
     except OSError as error:
@@ -89,6 +89,20 @@ def bundle(options: BundleOptions) -> Bundle:
             f"{output}: can't be written: {error.strerror or error}. Choose another with --output"
         ) from error
     return Bundle(output, {agent: told["problem"] for agent, told in vehicles.items() if "problem" in told})
+
+
+def _add(archive: zipfile.ZipFile, path: Path, name: Path) -> None:
+    """Add a file of the run.
+
+    Raises:
+        StartError: it has vanished since the folder was listed.
+        OSError: the archive can't be written.
+    """
+    try:
+        archive.write(path, name)
+    except FileNotFoundError as error:
+        text = f"{path}: has vanished, as the run is being packed. Repeat the command once it is finished"
+        raise StartError(text) from error
 
 
 def lines_of(bundled: Bundle) -> list[str]:

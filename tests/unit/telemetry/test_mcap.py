@@ -71,6 +71,23 @@ def test_a_file_dated_before_1980_is_bundled(folder: Path, tmp_path: Path) -> No
     assert f"{folder.name}/events.jsonl" in zipfile.ZipFile(written).namelist()
 
 
+def test_a_file_that_vanishes_while_it_is_bundled_is_named(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A launch that ends packs and removes what agents have written."""
+    ticks = folder / "agent-0.ticks"
+    ticks.write_bytes(b"")
+
+    def versions() -> dict[str, str]:
+        ticks.unlink()
+        return {}
+
+    monkeypatch.setattr("swarmctl.ops.bundle._versions", versions)
+    with pytest.raises(StartError, match=r"agent-0\.ticks: has vanished"):
+        bundle(BundleOptions(folder=folder, output=tmp_path / "run.zip"))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_summary_is_attached_as_it_is(folder: Path, path: Path) -> None:
     with path.open("rb") as file:
         attached = {attachment.name: attachment.data for attachment in make_reader(file).iter_attachments()}
