@@ -7,14 +7,17 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
 from sitl.simulate import simulate
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
-from swarmctl.ops.decide.verb import decisions_of_run, lines_of
+from swarmctl.ops.decide.verb import decisions_of_run, lines_of, notes_of_run
+from swarmctl.telemetry.recording.run_files import read_parquet, write_parquet
 from tests.closed_loop.conftest import mission_t_s
 
 CROSSING = (
@@ -103,6 +106,23 @@ def test_obstacles_that_were_set_in_flight_are_known(folder: Path, tmp_path: Pat
     assert sum('"obstacles_changed"' in line for line in lines) == 4, "two lists, of two agents"
     (bare / "events.jsonl").write_text("".join(line for line in lines if '"obstacles_changed"' not in line))
     assert sum(found.ticks for agent in decisions_of_run(bare, ()) for found in agent.differences) > 10
+
+
+def test_who_has_recorded_no_ticks_or_was_killed_is_named(folder: Path, tmp_path: Path) -> None:
+    assert notes_of_run(folder) == []
+    for name in ("missing", "empty"):
+        lacking = shutil.copytree(folder, tmp_path / name)
+        (lacking / "agent-1.parquet").unlink()
+        if name == "empty":
+            (lacking / "agent-1.ticks").write_bytes(b"")
+        assert [decided.agent for decided in decisions_of_run(lacking, ())] == [0]
+        (note,) = notes_of_run(lacking)
+        assert note.startswith("agent-1: no ticks were recorded")
+    killed = shutil.copytree(folder, tmp_path / "killed")
+    rows = read_parquet(killed / "agent-1.parquet")
+    write_parquet(killed / "agent-1.parquet", rows[: np.flatnonzero(rows["phase"] == Phase.TRACK)[-1]])
+    (note,) = notes_of_run(killed)
+    assert note.startswith("agent-1: its ticks end in TRACK; how others noticed is not replayed")
 
 
 def test_what_can_not_be_decided_again_is_refused(folder: Path, tmp_path: Path) -> None:

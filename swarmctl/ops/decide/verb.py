@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.bus.bus import agent_name
 from swarmctl.config import load, load_recorded
+from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.decide.again import Decisions, compare, decide_again
+from swarmctl.telemetry.evaluation.referee import RunData
+from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.recording.file_names import CONFIG
 from swarmctl.telemetry.recording.run_files import load_run, read_plans
 
@@ -30,12 +38,35 @@ def decisions_of_run(directory: Path, overrides: Sequence[str]) -> list[Decision
     run = load_run(directory)
     if config.swarm.agents != flown.swarm.agents:
         raise ConfigError("--set", [f"swarm.agents is that of the run, {flown.swarm.agents}"])
+    run = replace(run, ticks=_recorded(run))
     if not run.ticks:
         raise ConfigError(str(directory), ["holds no ticks of an agent, so that there is nothing to decide again"])
     plans = {agent: read_plans(directory, agent) for agent in run.ticks}
     return [
         compare(rows, decide_again(directory, config, run, plans, agent), agent) for agent, rows in run.ticks.items()
     ]
+
+
+def notes_of_run(directory: Path) -> list[str]:
+    """Return what is not known of a run that is decided again, one line for each agent that it is not known of.
+
+    Raises:
+        ConfigError: it is no run folder, or a file of it can't be read.
+    """
+    run, agents = load_run(directory), load_recorded(directory).swarm.agents
+    recorded, notes = _recorded(run), list[str]()
+    for agent in range(agents):
+        rows, name = recorded.get(agent), agent_name(agent)
+        if rows is None:
+            notes.append(f"{name}: no ticks were recorded; what it has said is not known to the others, nor compared")
+        elif len(flight_rows(rows[-1:])):
+            phase = Phase(int(rows["phase"][-1])).name
+            notes.append(f"{name}: its ticks end in {phase}; how others noticed is not replayed: they may differ")
+    return notes
+
+
+def _recorded(run: RunData) -> dict[int, NDArray[np.void]]:
+    return {agent: rows for agent, rows in run.ticks.items() if len(rows)}
 
 
 def lines_of(decisions: Decisions) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import signal
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -64,13 +65,15 @@ def replay(
 
 
 def _decide(folder: Path, sets: list[str], as_json: bool) -> int:
-    from swarmctl.ops.decide.verb import decisions_of_run, lines_of
+    from swarmctl.ops.decide.verb import decisions_of_run, lines_of, notes_of_run
 
     decisions = decisions_of_run(folder, sets)
     if as_json:
         print(json.dumps([dataclasses.asdict(agent) for agent in decisions], indent=2))
     else:
         print("\n".join(line for agent in decisions for line in lines_of(agent)))
+    for note in notes_of_run(folder):
+        print(note, file=sys.stderr)
     return EXIT_OK
 
 
