@@ -36,7 +36,7 @@ from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
     merge_tracks,
-    mission_start_us,
+    time_zero,
     track_error,
     unseen_spans,
     utc_offset_us,
@@ -135,6 +135,7 @@ def evaluate(
         "agents": rules.agents,
         "without": [agent for agent in range(rules.agents) if agent in without],
         "duration_s": max(tracked_s.values(), default=0.0),
+        "time_zero": clock.zero,
         "mode": rules.mode,
         "tracking": tracking,
         "goals": reached_goals(run.ticks, run.truth, run.events, goals_ned_m),
@@ -155,23 +156,21 @@ def evaluate(
 
 
 class _MissionClock:
-    """Converts instants to mission time if there is a mission, otherwise to time since the first arming.
+    """Converts instants to the time that verdict and report count, see `time_zero`.
 
     Attributes:
-        start_us: that instant.
+        zero: what its zero is.
         first_us: the first tick of any agent, at which configured obstacles are at their centres.
     """
 
     def __init__(self, ticks: Mapping[int, NDArray[np.void]], tracks: Tracks) -> None:
-        armed_us = float(tracks.t_us[0]) if len(tracks.t_us) else 0.0
-        start_us = mission_start_us(ticks, tracks.time_field)
-        self.start_us = armed_us if start_us is None else start_us
+        self._start_us, self.zero = time_zero(ticks, tracks)
         firsts_us = [float(rows[tracks.time_field][0]) for rows in ticks.values() if len(rows)]
-        self.first_us = min(firsts_us, default=armed_us)
+        self.first_us = min(firsts_us, default=self._start_us)
         self.utc_offset_us = 0.0 if tracks.time_field == "utc_us" else utc_offset_us(ticks)
 
     def at_s(self, t_us: float) -> float:
-        return (t_us - self.start_us) / 1e6
+        return (t_us - self._start_us) / 1e6
 
 
 def _agents_here(run: RunData, rules: Rules) -> Sequence[int]:

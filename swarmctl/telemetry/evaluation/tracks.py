@@ -100,6 +100,20 @@ def mission_start_us(ticks: Mapping[int, NDArray[np.void]], time_field: str) -> 
     return None
 
 
+def time_zero(ticks: Mapping[int, NDArray[np.void]], tracks: Tracks) -> tuple[float, str]:
+    """Return the instant from which verdict and report count, and what it is: mission start, of the first mission.
+
+    Without a mission it is the first arming, and the first tick where nobody was armed.
+    """
+    start_us = mission_start_us(ticks, tracks.time_field)
+    if start_us is not None:
+        return start_us, "mission start"
+    if len(tracks.t_us):
+        return float(tracks.t_us[0]), "the first arming"
+    firsts_us = [float(rows[tracks.time_field][0]) for rows in ticks.values() if len(rows)]
+    return min(firsts_us, default=0.0), "the first tick"
+
+
 def utc_offset_us(ticks: Mapping[int, NDArray[np.void]]) -> float:
     """Return UTC minus monotonic time of the host [us]; 0 when nothing was recorded."""
     for rows in ticks.values():

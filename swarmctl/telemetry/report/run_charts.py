@@ -22,10 +22,10 @@ from swarmctl.telemetry.evaluation.tracks import (
     flight_rows,
     goal_ned_m,
     merge_tracks,
-    mission_start_us,
     missions,
     newest_mission,
     shared_references,
+    time_zero,
     track_error,
     tracking_rows,
     true_positions,
@@ -74,9 +74,7 @@ class RunCharts:
         known = clocked.known or run.ticks  # of older recordings no clock is known
         self._tracks: Tracks = merge_tracks(known, run.truth, agents)
         self._time_field = "t_us" if len(run.truth) else "utc_us"
-        start_us = mission_start_us(known, self._time_field)
-        first_us = min((int(rows[self._time_field][0]) for rows in run.ticks.values() if len(rows)), default=0)
-        self._start_us = first_us if start_us is None else start_us
+        self._start_us, self.time_zero = time_zero(known, self._tracks)
         ends = [self._seconds(rows[[0, -1]]) for rows in run.ticks.values() if len(rows)]
         self._range = (min(e[0] for e in ends), max(e[1] for e in ends)) if ends else (0.0, 1.0)
         flown = [self._seconds(rows[[0, -1]]) for rows in map(tracking_rows, run.ticks.values()) if len(rows)]

@@ -45,7 +45,7 @@ def write_report(
         name=directory.resolve().name,
         summary=summary,
         flown=_flown(summary, missions, tracked_s),
-        several_missions=missions > 1,
+        time_zero="the start of the first mission" if missions > 1 else charts.time_zero,
         has_moments=bool(charts.moments),
         rows=summary_rows(summary, rules),
         arrivals=arrival_texts(summary["goals"]),

@@ -20,6 +20,7 @@ from swarmctl.core.recorded.tick_record import CURVES
 from swarmctl.core.types import ControlMode, Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.verbs.folders import report
+from swarmctl.telemetry.evaluation.referee import Rules, evaluate
 from swarmctl.telemetry.evaluation.tracks import shared_references
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.recording.run_files import load_run
@@ -32,6 +33,7 @@ from swarmctl.telemetry.report.from_above import Place, top_view
 from swarmctl.telemetry.report.run_charts import RunCharts
 from swarmctl.telemetry.report.thinning import shape_of
 from tests.benches.recorded_runs import UTC_US, flight, write_run
+from tests.unit.telemetry.test_referee import run, ticks
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -379,3 +381,21 @@ def test_what_can_not_be_compared_is_refused(folder: Path, tmp_path: Path) -> No
         report([folder, folder], figures=True)
     with pytest.raises(ConfigError, match="several folders"):
         report([folder], output=tmp_path / "page.html")
+
+
+def test_verdict_and_report_count_from_the_same_instant_and_name_it() -> None:
+    """Where no mission began: the verdict counted from the first arming, the report from the first tick."""
+    rows = ticks(10, (0.0, 0.0, 0.0))
+    rows["phase"], rows["mission_t_s"] = Phase.TAKEOFF, np.nan
+    rows["armed"][:150] = 0  # 3 s
+    rows["q_nb"][400:] = (0.0, 1.0, 0.0, 0.0)
+    data, rules = run({0: rows}), Rules(agents=1, required_separation_m=0.5)
+    summary = evaluate(data, rules, "failed")
+    assert summary["time_zero"] == "the first arming"
+    assert summary["violations"] == ["agent 0 turned over at 5.0 s"]
+    charts = RunCharts(data, summary, rules)
+    assert charts.time_zero == summary["time_zero"]
+    assert charts.time_of({"utc_us": int(rows["utc_us"][400])}) == pytest.approx(5.0)
+    rows["armed"] = 0
+    assert evaluate(data, rules, "failed")["time_zero"] == "the first tick"
+    assert evaluate(run({0: ticks(10, (0.0, 0.0, 0.0))}), rules, "failed")["time_zero"] == "mission start"
