@@ -28,7 +28,14 @@ from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.file_names import RECORDING, TRUTH, events_file, ticks_file
 from swarmctl.telemetry.recording.run_files import load_run, read_plans
-from swarmctl.telemetry.recording.run_folder import OUTCOME, Outcome, create_run_folder, finish_run, write_config
+from swarmctl.telemetry.recording.run_folder import (
+    OUTCOME,
+    Outcome,
+    create_run_folder,
+    finish_run,
+    held_run,
+    write_config,
+)
 from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording, simulated_recording
 from swarmctl.wall_clock import utc_us
 
@@ -36,6 +43,11 @@ from swarmctl.wall_clock import utc_us
 def simulate(config: Config, directory: Path) -> int:
     """Fly `config` in lockstep into the run folder `directory` and return the exit code."""
     write_config(directory, dump(config))
+    with held_run(directory):
+        return _simulate(config, directory)
+
+
+def _simulate(config: Config, directory: Path) -> int:
     flight = Lockstep(config, directory)
     stop = StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP, raise_at=2)  # the first request lands
     began_s = time.perf_counter()

@@ -17,7 +17,7 @@ from swarmctl.core.json_safe import to_json
 from swarmctl.core.recorded.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.files import is_held, replace_bytes, replace_text, write_each
+from swarmctl.files import hold, is_held, replace_bytes, replace_text, write_each
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
 from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.recording.file_names import (
@@ -110,6 +110,14 @@ def write_config(directory: Path, text: str) -> None:
         raise ConfigError(f"--run-dir {directory}", [f"holds another {CONFIG}. Choose a new folder or move that file"])
     replace_text(path, text)
     replace_bytes(directory / OUTCOME, b" " * _OUTCOME_BYTES)
+
+
+@contextlib.contextmanager
+def held_run(directory: Path) -> Iterator[None]:
+    """Keep others from finishing a run whose rows are in memory; for the folder of `write_config`."""
+    with (directory / OUTCOME).open("rb") as file:
+        hold(file.fileno())
+        yield
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,12 +247,12 @@ def refuse_as_output(output: Path, directory: Path, suffix: str) -> None:
 
 
 def _refuse_recorded(directory: Path) -> None:
-    """Check that nobody writes to the raw files of an unfinished run, which are packed and removed when it is finished.
+    """Check that nobody holds the files of an unfinished run, which are packed and removed when it is finished.
 
     Raises:
         StartError: somebody does.
     """
-    for pattern in ("*.ticks", "*.plans", events_file("*"), TRUTH):
+    for pattern in ("*.ticks", "*.plans", events_file("*"), TRUTH, OUTCOME):
         for path in sorted(directory.glob(pattern)):
             if is_held(path):
                 raise StartError(f"{path}: is still written: the run is not over. Wait until its agents have ended")

@@ -11,6 +11,12 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
+from swarmctl.errors import StartError
+from swarmctl.telemetry.evaluation.referee import Rules
+from swarmctl.telemetry.recording.run_folder import report_run
+
 SHORT = ("--agents", "1", "--duration", "2", "--set", "telemetry.enabled=false", "--set", "sitl.start=air")
 
 
@@ -45,3 +51,19 @@ def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:
         time.sleep(0.1)
     assert process.wait(120) == 130
     assert json.loads((folder / "summary.json").read_text())["outcome"] == "interrupted"
+
+
+def test_a_simulation_that_flies_is_not_finished_by_a_report(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    command = [sys.executable, "-m", "sitl.simulate", *SHORT[:2], "--duration", "600", "--run-dir", str(folder)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    until_s = time.monotonic() + 60.0
+    while not (folder / "agent-0.tlog").exists() and time.monotonic() < until_s:
+        time.sleep(0.05)
+    time.sleep(1.0)  # until it heeds signals
+    with pytest.raises(StartError, match="is still written"):
+        report_run(folder, Rules(agents=1, required_separation_m=0.5))
+    process.send_signal(signal.SIGINT)
+    assert process.wait(120) == 130
+    assert json.loads((folder / "summary.json").read_text())["outcome"] == "interrupted"
+    assert not (folder / "outcome.json").exists()
