@@ -63,14 +63,15 @@ def _simulate(config: Config, directory: Path) -> int:
 
         flight.run(on_step)
     wall_s = time.perf_counter() - began_s
+    interrupted = bool(stop.count)  # what is asked from here on is too late: it has landed
     problems = flight.problems()
-    outcome = "interrupted" if stop.count else "failed" if problems else "completed"
+    outcome = "interrupted" if interrupted else "failed" if problems else "completed"
     for log, agent in zip(flight.logs, flight.agents, strict=True):
         if agent is not None:
             for name, fields in agent.totals(lost=0).items():
                 log.event(name, log.clock.now_us(), log.clock.utc_us(), **fields)
     speed_factor = flight.clock.now_us() * 1e-6 / wall_s
-    shown = () if stop.count else tuple(problems)
+    shown = () if interrupted else tuple(problems)
     gone = _write_rows(flight, directory)
     finished = finish_run(
         directory,
@@ -89,7 +90,7 @@ def _simulate(config: Config, directory: Path) -> int:
     print_line(f"{speed_factor:.1f} x real time")
     if unwritten:
         print_line(unwritten_line(directory, finished.unwritten, gone))
-    if stop.count:
+    if interrupted:
         return EXIT_INTERRUPTED
     return EXIT_OK if summary["outcome"] == "completed" and not unwritten else EXIT_MISSION
 

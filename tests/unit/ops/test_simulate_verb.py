@@ -67,3 +67,13 @@ def test_a_simulation_that_flies_is_not_finished_by_a_report(tmp_path: Path) -> 
     assert process.wait(120) == 130
     assert json.loads((folder / "summary.json").read_text())["outcome"] == "interrupted"
     assert not (folder / "outcome.json").exists()
+
+
+def test_ctrl_c_while_files_are_packed_is_too_late(tmp_path: Path) -> None:
+    code = "import os, signal, sys; from sitl import simulate\nfinish = simulate.finish_run\n"
+    code += "def finish_run(*given):\n    os.kill(os.getpid(), signal.SIGINT)\n    return finish(*given)\n"
+    code += "simulate.finish_run = finish_run\nsys.exit(simulate.main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, *SHORT, "--run-dir", str(tmp_path / "run")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout.startswith("completed"), done.stderr
+    assert done.returncode == 0, "as it says"
