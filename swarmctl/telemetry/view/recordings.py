@@ -129,11 +129,12 @@ def simulated_recording(
     epoch_us = min((int(rows["utc_us"][0]) for rows in flown.values()), default=0)
     scene.obstacles(flight.obstacles, 0, 0.0)
     for first in range(0, max(map(len, flown.values()), default=0), _CHUNK_TICKS):
+        now_us = min(int(rows["utc_us"][first]) for rows in flown.values() if len(rows) > first) - epoch_us
         for agent, rows in flown.items():
             chunk = rows[first : first + _CHUNK_TICKS]
             scene.ticks(agent, chunk["utc_us"] - epoch_us, chunk)
         if any(obstacle.moves for obstacle in flight.obstacles):
-            scene.obstacles(flight.obstacles, first * 20_000, first * 0.02)
+            scene.obstacles(flight.obstacles, now_us, now_us * 1e-6)
         scene.plots()
     for agent, rows in flown.items():
         offset_us = int(rows["utc_us"][0] - rows["t_us"][0]) - epoch_us

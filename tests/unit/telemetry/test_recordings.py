@@ -24,6 +24,7 @@ from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.palette import CONTROL_RGB, MODE_RGB, PHASE_RGB, agent_rgb
 from swarmctl.telemetry.scene.quad_mesh import quad_glb
+from swarmctl.telemetry.scene.scene import Scene
 from swarmctl.telemetry.scene.separation_feed import SeparationFeed
 from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
 from swarmctl.telemetry.view.feed import AgentClock, Feed
@@ -73,6 +74,18 @@ def test_offline_recording_holds_the_run_and_can_be_packed(tmp_path: Path) -> No
     assert versions == [[__version__]]
     assert len(distances) == 120
     assert set(distances) == {1.0}
+
+
+@pytest.mark.parametrize("rate_hz", [25, 50])
+def test_an_obstacle_moves_to_the_end_of_a_recording_at_any_rate(
+    rate_hz: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn_s = list[float]()
+    monkeypatch.setattr(Scene, "obstacles", lambda _self, _obstacles, _t_us, elapsed_s: drawn_s.append(elapsed_s))
+    rows = flown(0, 601)[:: 50 // rate_hz]  # of 12 s
+    moving = Obstacle(center_ned_m=(5.0, 0.0, 0.0), vel_ned_m_s=(1.0, 0.0, 0.0))
+    simulated_recording(tmp_path, RunData({0: rows}, NO_TRUTH, []), viewed(1, obstacles=(moving,)))
+    assert max(drawn_s) == pytest.approx(12.0, abs=2.0)
 
 
 def test_recording_that_cannot_be_packed_stays(tmp_path: Path) -> None:
