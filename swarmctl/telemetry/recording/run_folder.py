@@ -284,6 +284,11 @@ def compare_runs(path: Path, runs: Sequence[tuple[Path, Rules]]) -> Path:
     for directory, _ in runs:
         refuse_as_output(path, directory, ".html")
     judged = [read_judged(directory, rules) for directory, rules in runs]
+    names = [run.name for run in judged]
+    judged = [
+        run._replace(name=f"{directory.resolve().parent.name}/{run.name}") if names.count(run.name) > 1 else run
+        for run, (directory, _) in zip(judged, runs, strict=True)
+    ]
     try:
         return write_comparison(path, judged)
     except OSError as error:

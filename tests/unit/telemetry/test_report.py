@@ -24,7 +24,7 @@ from swarmctl.telemetry.evaluation.referee import Rules, evaluate
 from swarmctl.telemetry.evaluation.tracks import shared_references
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.recording.run_files import load_run
-from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
+from swarmctl.telemetry.recording.run_folder import Outcome, compare_runs, finish_run
 from swarmctl.telemetry.report import svg
 from swarmctl.telemetry.report.charts import Line
 from swarmctl.telemetry.report.comparison import differences
@@ -399,3 +399,16 @@ def test_verdict_and_report_count_from_the_same_instant_and_name_it() -> None:
     rows["armed"] = 0
     assert evaluate(data, rules, "failed")["time_zero"] == "the first tick"
     assert evaluate(run({0: ticks(10, (0.0, 0.0, 0.0))}), rules, "failed")["time_zero"] == "mission start"
+
+
+def test_runs_of_one_name_are_told_apart_by_their_parents(tmp_path: Path) -> None:
+    runs = [tmp_path / parent / "flight" for parent in ("before", "after")]
+    for folder in runs:
+        folder.mkdir(parents=True)
+        write_run(folder, 1, 3.0)
+        (folder / "config.toml").write_text(dump(Config()))
+        finish_run(folder, Rules(agents=1, required_separation_m=0.5), Outcome(outcome="completed"))
+    rules = Rules(agents=1, required_separation_m=0.5)
+    page = compare_runs(tmp_path / "page.html", [(folder, rules) for folder in runs]).read_text()
+    assert page.count("before/flight") > 0
+    assert page.count("after/flight") > 0
