@@ -16,6 +16,7 @@ from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 from swarmctl.telemetry.evaluation.station_clock import corrected_text
 
+_LONGEST_NAME = 180  # bytes of a page's name: file systems take 255, of which its temporary name needs some
 _LATE_SHOWN = 5  # agents that are named because a station has not seen their beginning
 _MISSED_SHOWN = 5  # agents that are named because they have not reached their goals
 
@@ -95,6 +96,9 @@ def compare(directories: Sequence[Path], output: Path | None) -> Path:
 
     runs = [(directory, load_recorded(directory).rules()) for directory in directories]
     names = "-against-".join(directory.resolve().name for directory in directories)
+    if len(names.encode()) > _LONGEST_NAME:
+        first, last = directories[0].resolve().name, directories[-1].resolve().name
+        names = f"{first}-against-{len(directories) - 2}-and-{last}"
     return compare_runs(output or directories[-1].resolve().parent / f"{names}.html", runs)
 
 

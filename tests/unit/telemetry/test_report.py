@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from swarmctl.config import Config, dump, load_recorded
+from swarmctl.configuration.sections import SwarmParams
 from swarmctl.core.recorded.tick_record import CURVES
 from swarmctl.core.types import ControlMode, Phase
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.ops.flight.summary import compare
 from swarmctl.ops.verbs.folders import report
 from swarmctl.telemetry.evaluation.referee import Rules, evaluate
 from swarmctl.telemetry.evaluation.tracks import shared_references
@@ -412,3 +414,16 @@ def test_runs_of_one_name_are_told_apart_by_their_parents(tmp_path: Path) -> Non
     page = compare_runs(tmp_path / "page.html", [(folder, rules) for folder in runs]).read_text()
     assert page.count("before/flight") > 0
     assert page.count("after/flight") > 0
+
+
+def test_many_runs_are_compared_on_a_page_whose_name_file_systems_take(tmp_path: Path) -> None:
+    folders = [tmp_path / f"20261129T01450{k}Z-circle-with-a-name" for k in range(9)]
+    for folder in folders:
+        folder.mkdir()
+        write_run(folder, 1, 3.0)
+        (folder / "config.toml").write_text(dump(Config(swarm=SwarmParams(agents=1))))
+        finish_run(folder, Rules(agents=1, required_separation_m=0.5), Outcome(outcome="completed"))
+    path = compare(folders, None)
+    assert path.name == f"{folders[0].name}-against-7-and-{folders[-1].name}.html"
+    assert path.exists()
+    assert compare(folders[:2], None).name == f"{folders[0].name}-against-{folders[1].name}.html"
