@@ -121,7 +121,7 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     most = rules.deadline_misses_01 if rules else None
     good = None if share is None or most is None else share <= most
     late = f"{timing['late_ticks']} of {due}"
-    limit = "" if most is None else f"{most:.0%}"
+    limit = "" if most is None else f"{100 * most:.3g}%"
     yield SummaryRow(f"deadline misses {IN_FLIGHT}", late, limit, good, timing["late_ticks"])
     named = (
         ("summed mean tracking error", "index_m", SUMMED_ERROR),

@@ -33,6 +33,7 @@ from swarmctl.telemetry.report.comparison import differences
 from swarmctl.telemetry.report.event_table import event_rows
 from swarmctl.telemetry.report.from_above import Place, top_view
 from swarmctl.telemetry.report.run_charts import RunCharts
+from swarmctl.telemetry.report.run_report import summary_rows
 from swarmctl.telemetry.report.thinning import shape_of
 from tests.benches.recorded_runs import UTC_US, flight, write_run
 from tests.unit.telemetry.test_referee import run, ticks
@@ -427,3 +428,11 @@ def test_many_runs_are_compared_on_a_page_whose_name_file_systems_take(tmp_path:
     assert path.name == f"{folders[0].name}-against-7-and-{folders[-1].name}.html"
     assert path.exists()
     assert compare(folders[:2], None).name == f"{folders[0].name}-against-{folders[1].name}.html"
+
+
+@pytest.mark.parametrize(("limit_01", "shown"), [(0.2, "20%"), (0.004, "0.4%"), (0.0, "0%"), (1.0, "100%")])
+def test_a_small_limit_of_deadline_misses_is_shown_as_it_is(limit_01: float, shown: str) -> None:
+    rules = Rules(agents=1, required_separation_m=0.5, deadline_misses_01=limit_01)
+    summary = evaluate(run({0: ticks(2, (0.0, 0.0, 0.0))}), rules, "completed")
+    (row,) = [row for row in summary_rows(summary, rules) if row.name.startswith("deadline misses")]
+    assert row.limit == shown
