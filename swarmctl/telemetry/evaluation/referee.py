@@ -110,7 +110,8 @@ def evaluate(
     clock = _MissionClock(known, tracks)
     without = _flown_without(run.events)
     here = [agent for agent in _agents_here(run, rules) if agent not in without]
-    separation, apart = _evaluate_separation(tracks, rules, here, clock)
+    flew = outcome == "completed" or _has_armed(run)
+    separation, apart = _evaluate_separation(tracks, rules, here if flew else (), clock)
     obstacles, clear = _evaluate_obstacles(tracks, rules, clock)
     volume, inside = _evaluate_volume(run, tracks, rules, clock)
     timing, punctual = _evaluate_timing(run.ticks, rules, speed_factor)
@@ -179,6 +180,11 @@ def _agents_here(run: RunData, rules: Rules) -> Sequence[int]:
     listed = started.get("agents")
     of_swarm = range(rules.agents)
     return [agent for agent in of_swarm if agent in listed] if isinstance(listed, list) and listed else of_swarm
+
+
+def _has_armed(run: RunData) -> bool:
+    """Return whether a vehicle was armed in what was recorded: before that nobody keeps a distance."""
+    return bool(run.truth["armed"].any()) or any(rows["armed"].any() for rows in run.ticks.values())
 
 
 def _flown_without(events: Sequence[Mapping[str, Any]]) -> frozenset[int]:

@@ -201,6 +201,17 @@ def test_positions_that_were_never_recorded_are_no_pass() -> None:
     assert "can't be judged" in summary["violations"][0]
 
 
+@pytest.mark.parametrize("outcome", ["interrupted", "failed"])
+def test_who_ended_before_anybody_was_armed_has_no_distances_to_judge(outcome: str) -> None:
+    waiting = ticks(3, (math.nan, 0.0, 0.0))
+    waiting["phase"], waiting["armed"] = Phase.STANDBY, 0
+    rules = Rules(agents=2, required_separation_m=0.5)
+    for by_agent in ({}, {0: waiting}, {0: waiting, 1: waiting}):
+        assert evaluate(run(by_agent), rules, outcome)["violations"] == []
+    armed = ticks(3, (math.nan, 0.0, 0.0))
+    assert "separation of agent 0 can't be judged" in evaluate(run({0: armed}), rules, outcome)["violations"][0]
+
+
 @pytest.mark.parametrize(("margin_m", "violated"), [(0.05, True), (0.3, False)])
 def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bool) -> None:
     rules = Rules(
