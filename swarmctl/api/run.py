@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,7 +114,8 @@ def load_run(folder: str | Path) -> Run:
     config = load_recorded(folder)
     checked = read_summary(folder)
     if checked is None:
-        problem = f"holds no {SUMMARY}: the run still flies, or was cut off. Then complete it: swarmctl report {folder}"
+        advice = f"Then complete it: swarmctl report {shlex.quote(str(folder))}"
+        problem = f"holds no {SUMMARY}: the run still flies, or was cut off. {advice}"
         raise ConfigError(str(folder), [problem])
     refuse_other_swarm(folder, checked, config.swarm.agents)
     summary = json.loads(read_text(folder / SUMMARY))  # all of it, while `checked` is what the report needs

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 from swarmctl.config import load_recorded
 from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.discovery.own import OwnError
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.export.mcap import RecordedFlight, write_mcap
 from swarmctl.telemetry.recording.run_files import SUMMARY, read_plans, read_text
 from swarmctl.telemetry.recording.run_folder import read_judged, refuse_as_output
@@ -38,7 +40,8 @@ def export_mcap(directory: Path, output: Path | None) -> Path:
         summary_json=read_text(directory / SUMMARY),
     )
     try:
-        write_mcap(path, recorded)
+        with StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1):  # leaves nothing of a file that is not finished
+            write_mcap(path, recorded)
     except OSError as error:
         raise StartError(f"{path}: can't be written: {error.strerror or error}") from error
     return path

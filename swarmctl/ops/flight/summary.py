@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,7 @@ def unwritten_line(directory: Path, unwritten: Sequence[str], gone: Sequence[str
     advice = (
         f"What of {files} was not written is lost: make room, and fly again"
         if gone
-        else f"Make room, then: swarmctl report {directory}"
+        else f"Make room, then: swarmctl report {shlex.quote(str(directory))}"
     )
     return f"not everything could be written to {directory}: {named}. {advice}"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -303,7 +304,9 @@ def read_judged(directory: Path, rules: Rules) -> JudgedRun:
     """
     summary = read_summary(directory)
     if summary is None:
-        raise ConfigError(str(directory), [f"holds no {SUMMARY}. Complete the run: swarmctl report {directory}"])
+        raise ConfigError(
+            str(directory), [f"holds no {SUMMARY}. Complete the run: swarmctl report {shlex.quote(str(directory))}"]
+        )
     refuse_other_swarm(directory, summary, rules.agents)
     run, config_text = load_run(directory), read_text(directory / CONFIG)
     return JudgedRun(directory.resolve().name, run, summary, _with_obstacles(rules, run), config_text)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -27,6 +28,7 @@ from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.bundle import BundleOptions, bundle
 from swarmctl.ops.export import export_mcap
+from swarmctl.ops.flight.summary import unwritten_line
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_folder import Outcome, compare_runs, finish_run
 from swarmctl.telemetry.view.recordings import viewer_binary
@@ -86,6 +88,28 @@ def test_a_file_that_vanishes_while_it_is_bundled_is_named(
     with pytest.raises(StartError, match=r"agent-0\.ticks: has vanished"):
         bundle(BundleOptions(folder=folder, output=tmp_path / "run.zip"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_export_that_is_terminated_leaves_nothing(folder: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(folder, tmp_path / "flown")
+    code = "import os, signal, sys, time\nfrom pathlib import Path\nimport swarmctl.ops.export as export\n"
+    code += "from swarmctl.files import replaced\ndef write(path, recorded):\n    with replaced(path) as file:\n"
+    code += "        os.kill(os.getpid(), signal.SIGTERM)\n        time.sleep(5)\n"
+    code += "export.write_mcap = write\nexport.export_mcap(Path(sys.argv[1]), None)"
+    done = subprocess.run([sys.executable, "-c", code, str(copy)], capture_output=True, timeout=60, check=False)
+    assert done.returncode != 0
+    assert [path.name for path in tmp_path.iterdir()] == ["flown"]
+
+
+def test_advice_can_be_pasted_into_a_shell_whatever_the_folder_is_called(tmp_path: Path) -> None:
+    spaced = tmp_path / "kl e x"
+    spaced.mkdir()
+    (spaced / "config.toml").write_text(dump(Config()))
+    with pytest.raises(ConfigError, match="kl e x'"):
+        export_mcap(spaced, None)
+    with pytest.raises(ConfigError, match="kl e x'"):
+        load_run(spaced)
+    assert unwritten_line(spaced, ["report.html: No space"]).endswith(f"swarmctl report '{spaced}'")
 
 
 def test_the_summary_is_attached_as_it_is(folder: Path, path: Path) -> None:
