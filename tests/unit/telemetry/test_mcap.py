@@ -30,6 +30,7 @@ from swarmctl.ops.bundle import BundleOptions, bundle
 from swarmctl.ops.export import export_mcap
 from swarmctl.ops.flight.summary import unwritten_line
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
+from swarmctl.telemetry.recording.run_files import read_parquet, write_parquet
 from swarmctl.telemetry.recording.run_folder import Outcome, compare_runs, finish_run
 from swarmctl.telemetry.view.recordings import viewer_binary
 from tests.benches.recorded_runs import UTC_US, write_run
@@ -110,6 +111,24 @@ def test_advice_can_be_pasted_into_a_shell_whatever_the_folder_is_called(tmp_pat
     with pytest.raises(ConfigError, match="kl e x'"):
         load_run(spaced)
     assert unwritten_line(spaced, ["report.html: No space"]).endswith(f"swarmctl report '{spaced}'")
+
+
+def test_events_of_a_station_are_exported_by_its_clock(folder: Path, tmp_path: Path) -> None:
+    directory, hour_us = shutil.copytree(folder, tmp_path / "station"), 3_600_000_000
+    rows = read_parquet(directory / "agent-1.parquet")
+    t_us, utc_us = int(rows["t_us"][0]), int(rows["utc_us"][0])
+    rows["utc_us"] += hour_us
+    write_parquet(directory / "agent-1.parquet", rows)
+    events = [{"utc_us": utc_us, "t_us": t_us, "source": "launch", "event": "started", "agents": []}]
+    events += [
+        {"utc_us": utc_us, "source": "launch", "event": "sender_clock", "agent": k, "behind_us": 0} for k in range(3)
+    ]
+    events.append(
+        {"utc_us": utc_us + hour_us + 5, "t_us": t_us, "source": "agent-1", "event": "operator", "verb": "hold"}
+    )
+    (directory / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
+    (time_ns,) = [at_ns for at_ns, log in messages(export_mcap(directory, None), "/events") if log.name == "agent-1"]
+    assert time_ns == (utc_us + 5) * 1000
 
 
 def test_the_summary_is_attached_as_it_is(folder: Path, path: Path) -> None:
