@@ -26,10 +26,9 @@ from swarmctl.files import replace_bytes, write_each
 from swarmctl.ops.flight.summary import summary_lines, unwritten_line, violation_lines
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.telemetry.recording.file_names import RECORDING, TRUTH, events_file, ticks_file
+from swarmctl.telemetry.recording.file_names import OUTCOME, RECORDING, TRUTH, events_file, ticks_file
 from swarmctl.telemetry.recording.run_files import load_run, read_plans
 from swarmctl.telemetry.recording.run_folder import (
-    OUTCOME,
     Outcome,
     create_run_folder,
     finish_run,

@@ -11,7 +11,8 @@ from swarmctl.core.discovery.own import OwnError
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.export.mcap import RecordedFlight, write_mcap
-from swarmctl.telemetry.recording.run_files import SUMMARY, read_plans, read_text
+from swarmctl.telemetry.recording.file_names import SUMMARY
+from swarmctl.telemetry.recording.run_files import read_plans, read_text
 from swarmctl.telemetry.recording.run_folder import read_judged, refuse_as_output
 
 

@@ -119,7 +119,7 @@ def evaluate(
     unseen = [] if len(run.truth) else [*clocked.problems(), *_unseen(clocked, rules.agents, clock)]
     refused = _shorten(list(refused_peers(run.events)))
     if clocked.ahead_s is None:
-        lacking = unrecorded(run.ticks, run.truth, run.events, here=here, at_s=clock.at_s)
+        lacking = unrecorded(run.ticks, run.truth, here=here, at_s=clock.at_s)
         unseen += _shorten(list(lacking))
     configured = dict(enumerate(rules.goals_ned_m))
     goals_ned_m = {agent: configured.get(agent) for agent in here}

@@ -7,38 +7,34 @@ ticks. So true states are missing only where agents have received states of the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.types import Array
 from swarmctl.telemetry.evaluation.tracks import located_states_us
-from swarmctl.telemetry.json_safe import finite
 
 _AFTER_US = 500_000  # true states that a killed simulator has not written, and errors of clocks
 _BEFORE_US = 100_000
+_TOLERATED_01 = 0.01  # of the ticks in flight, as many as may be late by default: the others judge the flight as well
 _LOST_US = 20_000  # between the times that are filled in for ticks which were not recorded
 
 
 def unrecorded(
     ticks: Mapping[int, NDArray[np.void]],
     truth: NDArray[np.void],
-    events: Sequence[Mapping[str, Any]],
     *,
     here: Sequence[int],
     at_s: Callable[[float], float],
 ) -> Iterator[str]:
-    """Yield a violation for each agent with lost records or without ticks, and one for true states that are missing.
+    """Yield a violation for each agent whose ticks are missing, and one for true states that are missing.
 
     Args:
         ticks: by agent, rows of `TICK_DTYPE` that this computer has recorded.
         truth: rows of `TRUTH_DTYPE`, empty without a simulator.
-        events: of all sources.
         here: agents that are judged.
         at_s: returns the mission time of an instant of the clock of `truth`, or of UTC without it.
     """
-    lost = _lost_records(events)
     clock = "t_us" if len(truth) else "utc_us"
     armed = bool(truth["armed"].any()) or any(rows["armed"].any() for rows in ticks.values())
     for agent in here:
@@ -47,30 +43,20 @@ def unrecorded(
             if armed and len(truth):
                 yield f"agent {agent} has recorded no tick: how it was flown can't be judged"
             continue
-        missing = _missing_ticks(rows)
-        if count := int(missing.sum()):
+        missing = _missing_in_flight(rows)
+        count = int(missing.sum())
+        if count > _TOLERATED_01 * np.count_nonzero(rows["armed"]):
             since_s = at_s(float(rows[clock][np.argmax(missing > 0)]))
             why = "which can't be judged"
             yield f"{count} ticks of agent {agent} could not be recorded, the first at {since_s:.1f} s, {why}"
-        elif lost.get(agent):
-            yield f"{lost[agent]} records of agent {agent} could not be written: what was in them can't be judged"
     yield from _missing_truth(ticks, truth, at_s)
 
 
-def _lost_records(events: Sequence[Mapping[str, Any]]) -> dict[int, int]:
-    """Return the number of records of each agent that its disk did not take, by its last summary."""
-    found = dict[int, int]()
-    for event in events:
-        source, number = str(event.get("source")).rpartition("-")[::2]
-        if event.get("event") == "bus_summary" and source == "agent" and number.isdecimal():
-            found[int(number)] = int(finite(event.get("lost")) or 0)
-    return found
-
-
-def _missing_ticks(rows: NDArray[np.void]) -> NDArray[np.int64]:
-    """Return the number of ticks (T - 1,) that were run between those that were recorded."""
+def _missing_in_flight(rows: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return the number of ticks (T - 1,) that an agent ran, of an armed vehicle, between those that were recorded."""
     steps = np.diff(rows["seq"].astype(np.int64))
-    missing: NDArray[np.int64] = np.maximum(steps - 1, 0)
+    armed = rows["armed"] != 0
+    missing: NDArray[np.int64] = np.where(armed[:-1] | armed[1:], np.maximum(steps - 1, 0), 0)
     return missing
 
 
@@ -102,7 +88,7 @@ def _missing_truth(
 def _flown_us(rows: NDArray[np.void]) -> Array:
     """Return the times at which an armed vehicle was simulated: those of its states, and of ticks that are missing."""
     armed = rows["armed"] != 0
-    of_missing = np.flatnonzero((_missing_ticks(rows) > 0) & (armed[:-1] | armed[1:]))
+    of_missing = np.flatnonzero(_missing_in_flight(rows))
     spans_us = [(rows["t_us"][k], rows["t_us"][k + 1]) for k in of_missing]
     missing_us = [np.arange(begin, end, _LOST_US, dtype=np.float64) for begin, end in spans_us]
     return np.concatenate([located_states_us(rows[armed]), *missing_us])

@@ -25,6 +25,7 @@ from swarmctl.telemetry.recording.file_names import (
     AGENT_FILE,
     CONFIG,
     EVENTS,
+    OUTCOME,
     PACKED_PLANS,
     PACKED_TICKS,
     PACKED_TRUTH,
@@ -47,7 +48,6 @@ from swarmctl.telemetry.recording.run_files import (
 from swarmctl.telemetry.report.comparison import JudgedRun, write_comparison
 from swarmctl.telemetry.report.run_report import FIGURES, REPORT, write_figures, write_report
 
-OUTCOME = "outcome.json"  # how a run ended; there until everything is written
 _OUTCOME_BYTES = 4096
 _PROBLEM_CHARACTERS = 500  # of a problem that is kept in it
 _LAUNCHES_PER_SECOND = 1000

@@ -24,6 +24,7 @@ from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import hold
 from swarmctl.telemetry.evaluation.referee import Rules
 from swarmctl.telemetry.recording import run_folder
+from swarmctl.telemetry.recording.file_names import OUTCOME
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run, write_config
@@ -282,13 +283,13 @@ def test_how_a_run_ended_is_known_once_there_is_room(
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["outcome"] == outcome.outcome
     assert summary["violations"][:1] == list(problems[:1])
-    assert not (tmp_path / run_folder.OUTCOME).exists()
+    assert not (tmp_path / OUTCOME).exists()
 
 
 def test_a_completed_run_whose_recording_ends_in_flight_is_not_judged_to_its_end(tmp_path: Path) -> None:
     write_config(tmp_path, "")
     write_run(tmp_path, 3, 20.0)
-    (tmp_path / run_folder.OUTCOME).write_text('{"outcome": "completed", "problems": []}')
+    (tmp_path / OUTCOME).write_text('{"outcome": "completed", "problems": []}')
     report_run(tmp_path, RULES)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert "the recording of agent 0 ends in LAND: the rest of its flight can't be judged" in summary["violations"]

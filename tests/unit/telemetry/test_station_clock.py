@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.topics import OBSTACLES, STATUS, TICK
+from swarmctl.core.json_safe import to_json
 from swarmctl.core.recorded.records import pack_tick
 from swarmctl.core.types import Phase
 from swarmctl.ops.flight.station import SwarmWatch
@@ -21,7 +22,6 @@ from swarmctl.ops.flight.summary import summary_lines
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
 from swarmctl.telemetry.evaluation.station_clock import corrected_text
-from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.recording.run_files import load_run
 from swarmctl.telemetry.recording.summary_file import decode_summary
 from swarmctl.telemetry.report.run_charts import RunCharts
