@@ -265,10 +265,12 @@ class WorldModel:
         Where its process has ended, the vehicle gets no setpoint. One that is merely silent may fly on as it planned,
         or have stopped: expected in one way alone, others came to 0.17 m of it in the other.
         """
-        agent = path.agent
-        if not self._flies_itself(agent) or self._is_parked(agent):
+        agent, status = path.agent, self._status.get(path.agent)
+        if status is None or self._is_parked(agent):
             return (path,)
-        if self._has_died(agent):
+        if status.boot_id == path.boot_id and not self._flies_itself(agent):
+            return (path,)  # as its autopilot or a pilot flies it
+        if self._ends.has_ended(agent, path.boot_id):  # whatever a process says that was started after it
             return (without_setpoints(path),)
         oldest_us = utc_us - _EXPECTED_US
         if path.t0_utc_us >= oldest_us or all(late.agent != agent for late in self.paths.late(oldest_us)):
