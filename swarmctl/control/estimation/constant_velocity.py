@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
-from swarmctl.core.trajectory import braking_displacement
+from swarmctl.core.trajectory import braking_displacement, interpolated
 from swarmctl.core.types import Array, FlightMode, Plan, VehicleState
 
 CREEP_M_S = 0.5  # a slower vehicle in hold is taken to rest: estimates of hovering ones wander as fast
@@ -51,14 +51,13 @@ def predict_after_setpoints(
 
     As `predict_without_setpoints`, of a vehicle that has followed the plan until then.
     """
-    step = min(max(0.0, (last_us - plan.t0_us) / plan.dt_us), len(plan.pos_ned_m) - 1.0)
-    begun = min(int(step), len(plan.pos_ned_m) - 2)
-    part_01 = step - begun
-    pos, next_pos = plan.pos_ned_m[begun : begun + 2]
-    vel, next_vel = plan.vel_ned_m_s[begun : begun + 2]
-    accel_ned_m_s2 = (next_vel - vel) / (plan.dt_us * 1e-6)
+    last = len(plan.pos_ned_m) - 1
+    step = max(0.0, (last_us - plan.t0_us) / plan.dt_us)
+    pos, vel = (interpolated(points, np.array([step]), last)[0] for points in (plan.pos_ned_m, plan.vel_ned_m_s))
+    begun = min(int(step), last - 1)
+    accel_ned_m_s2 = (plan.vel_ned_m_s[begun + 1] - plan.vel_ned_m_s[begun]) / (plan.dt_us * 1e-6)
     accel_ned_m_s2[2] = 0.0
-    motion = (pos + part_01 * (next_pos - pos), vel + part_01 * (next_vel - vel), accel_ned_m_s2)
+    motion = (pos, vel, accel_ned_m_s2)
     return _kept(motion, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)
 
 
