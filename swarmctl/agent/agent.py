@@ -257,6 +257,7 @@ class Agent:
         self._vehicle_watch.report_jump(now_us)
         self._vehicle_watch.report_accuracy(now_us, is_standing=self._mission.phase < Phase.ARM)
         self._vehicle_watch.report_loss(now_us)
+        self._vehicle_watch.report_unheard(now_us)
         if state is not None:
             self._own_state.update(state, autopilot.hover_thrust_01, controls=self._mission.had_control)
         return state

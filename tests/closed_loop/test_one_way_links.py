@@ -13,6 +13,7 @@ from swarmctl.config import load
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array, FlightMode, VehicleState
 from swarmctl.mavlink.vehicle.autopilot import Autopilot
+from swarmctl.mavlink.vehicle.heard_setpoints import HeardSetpoints
 from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
 from swarmctl.simulator_config import FaultParams
 from tests.closed_loop.conftest import COARSE, ROOT, mission_t_s
@@ -21,7 +22,7 @@ from tests.faults.simulated import SWAP
 
 ARDUCOPTERS = Path(ROOT, "configs", "ardupilot_sitl.toml")
 VICTIM = 1
-Direction = Literal["both", "from_vehicle"]
+Direction = Literal["both", "from_vehicle", "to_vehicle"]
 
 
 def lost(flight: Lockstep, direction: Direction, *, after_s: float = 1.5, for_s: float = 17.0) -> float:
@@ -51,10 +52,10 @@ def test_negative_control_heartbeats_that_go_on_keep_it_flying_into_others(monke
     assert FlightMode(int(flight.world.truth_rows()["flight_mode"][VICTIM])) is FlightMode.EXTERNAL
 
 
-def lost_amid_a_turn(after_s: float, config: Path | None) -> float:
-    """Lose what the victim's vehicle says while four turn around each other; the least separation [m]."""
+def lost_amid_a_turn(after_s: float, config: Path | None, direction: Direction = "from_vehicle") -> float:
+    """Lose what the victim's vehicle says, or hears, while four turn around each other; the least separation [m]."""
     flight = Lockstep(load(config, (*COARSE, *PASSING)))
-    return lost(flight, "from_vehicle", after_s=after_s, for_s=4.0)
+    return lost(flight, direction, after_s=after_s, for_s=4.0)
 
 
 @pytest.mark.parametrize(("after_s", "config"), [(2.8, ARDUCOPTERS), (2.4, None)], ids=["arducopter", "px4"])
@@ -75,6 +76,22 @@ def test_others_keep_clear_of_both_ways_that_a_link_may_have_failed(
 
     monkeypatch.setattr(PathPublisher, "_without_link", deaf)
     assert lost_amid_a_turn(after_s, config) < 0.65, "negative control"
+
+
+@pytest.mark.parametrize(
+    ("after_s", "config", "least_m"), [(2.3, ARDUCOPTERS, 0.85), (2.6, None, 0.8)], ids=["arducopter", "px4"]
+)
+def test_others_keep_clear_of_where_a_vehicle_that_misses_its_setpoints_flies(
+    after_s: float, config: Path | None, least_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its states go on to arrive: that it does not follow is seen by the setpoint that it repeats.
+
+    Of 24 flights from shifted starts (six times, two agents) ArduCopters come to 0.85 m, without this to 0.67 m; the
+    vehicles of the thesis with PX4, which accelerate harder, to 0.63 and 0.55 m, 12 and 19 of them below 0.85 m.
+    """
+    assert lost_amid_a_turn(after_s, config, "to_vehicle") >= least_m
+    monkeypatch.setattr(HeardSetpoints, "unheard_since_us", lambda *times: None)
+    assert lost_amid_a_turn(after_s, config, "to_vehicle") < 0.7, "negative control"
 
 
 def least_with_a_filling_link_m() -> float:

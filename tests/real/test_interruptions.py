@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 
 import pyarrow.parquet as pq
 import pymap3d
@@ -245,8 +247,9 @@ port, beyond = {ports}
 ears = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)  # towards the vehicle
 mouth = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)  # towards the agent
 ears.bind(("127.0.0.1", port))
-vehicle, deaf = None, []
-signal.signal(signal.SIGUSR1, lambda *_: deaf.append(True))
+vehicle, deaf, mute = None, [], []
+signal.signal(signal.SIGUSR1, lambda *_: deaf.append(True))  # the agent hears nothing any more
+signal.signal(signal.SIGUSR2, lambda *_: mute.append(True))  # nor is it heard
 chosen = selectors.DefaultSelector()
 for one in (ears, mouth):
     chosen.register(one, selectors.EVENT_READ)
@@ -257,21 +260,55 @@ while True:
             if not deaf:
                 mouth.sendto(data, ("127.0.0.1", beyond))
         elif vehicle is not None:
-            ears.sendto(mouth.recv(4096), vehicle)
+            data = mouth.recv(4096)
+            if not mute:
+                ears.sendto(data, vehicle)
 """
+
+
+@contextlib.contextmanager
+def relayed(here: Field, port: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Relay between a vehicle that sends to a port and an agent that listens 10000 above it."""
+    program = RELAY.format(ports=(port, port + 10_000))
+    with subprocess.Popen([*here.fleet.network.prefix, sys.executable, "-c", program]) as relay:
+        try:
+            yield relay
+        finally:
+            relay.kill()
+
+
+def lone(port: int) -> tuple[str, ...]:
+    """Return the options of a launch that flies one vehicle through the relay at a port."""
+    vehicle = f'vehicles=[{{sysid=1, url="udpin://127.0.0.1:{port + 10_000}"}}]'
+    return "--set", "swarm.agents=1", "--set", vehicle
 
 
 def test_an_arducopter_that_its_agent_does_not_hear_lands_by_its_own_failsafe(field: Fielder) -> None:
     here = booted(field, 1)
-    relay = subprocess.Popen([*here.fleet.network.prefix, sys.executable, "-c", RELAY.format(ports=(14550, 24550))])
-    try:
-        launched = here.launch(ARDUPILOT_CONFIG, "--set", 'vehicles=[{sysid=1, url="udpin://127.0.0.1:24550"}]')
+    with relayed(here, 14550) as relay:
+        launched = here.launch(ARDUPILOT_CONFIG, *lone(14550))
         launched.until_phase("TRACK", 1)
         time.sleep(3.0)
         relay.send_signal(signal.SIGUSR1)
         here.witness.wait(lambda: mode_of(here, 0) == LAND, ACTS_S, "landing")
         here.witness.wait(lambda: not here.witness.vehicles[0].armed, GROUND_S, "landed and disarmed")
         assert launched.end(END_S) == EXIT_MISSION, launched.text()
-    finally:
-        relay.kill()
-        relay.wait()
+
+
+@pytest.mark.parametrize(("kind", "config", "port"), [(PX4, PX4_CONFIG, 14540), (ARDUCOPTER, ARDUPILOT_CONFIG, 14550)])
+def test_a_vehicle_that_misses_its_setpoints_is_known_to_before_its_failsafe_acts(
+    field: Fielder, kind: Kind, config: str, port: int
+) -> None:
+    """By the setpoint that it repeats; in 8 s of flight before none is missed."""
+    here = booted(field, 1) if kind is ARDUCOPTER else field(kind, 1)
+    with relayed(here, port) as relay:
+        launched = here.launch(config, *lone(port))
+        launched.until_phase("TRACK", 1)
+        time.sleep(8.0)
+        cut_us = time.clock_gettime(time.CLOCK_BOOTTIME) * 1e6
+        relay.send_signal(signal.SIGUSR2)
+        here.witness.wait(lambda: not here.witness.vehicles[0].armed, GROUND_S, "landed and disarmed")
+        launched.end(END_S)
+        told = launched.events("setpoints_unheard", "agent-0")
+        assert told[0]["unheard"], told
+        assert 0.04 < (told[0]["t_us"] - cut_us) * 1e-6 < 0.3, "the failsafe of a PX4 acts after 0.5 s"

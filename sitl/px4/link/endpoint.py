@@ -22,7 +22,7 @@ from sitl.px4.link.parameters import ParameterLink
 from sitl.px4.link.schedule import OFFBOARD_HZ, Schedule
 from sitl.px4.link.streams import Fields, LinkCounts, Report
 from sitl.px4.link.streams_health import STREAMS
-from sitl.px4.modes import MODE_NAMES, STANDARD_MODES
+from sitl.px4.modes import MODE_NAMES, STANDARD_MODES, Px4Mode
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import Transport
@@ -89,6 +89,7 @@ class Endpoint:
         self._greeted = False
         self._gcs_us: int | None = None  # last heartbeat of a ground station
         self._origin_sent: object = None
+        self._target_us: int | None = None  # when the setpoint came that ATTITUDE_TARGET has told last
         self._status_sent: tuple[object, ...] = ()
         self._seen: set[tuple[int, int]] = set()
         self._texts: deque[tuple[int, Severity, str]] = deque()
@@ -297,7 +298,15 @@ class Endpoint:
     def _has_content(self, message: int, placed: bool) -> bool:
         if message == _CURRENT_MODE:
             return self._status_is_new()
+        if message == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
+            return self._target_is_new()
         return placed or not STREAMS[message].needs_position
+
+    def _target_is_new(self) -> bool:
+        """Return whether there is another target than was told last: in OFFBOARD each setpoint is one, told once."""
+        told_us, pilot = self._target_us, self._autopilot
+        self._target_us = pilot.stream.newest_us
+        return pilot.mode != Px4Mode.OFFBOARD or self._target_us != told_us
 
     def _status_is_new(self) -> bool:
         """Return whether PX4 has published its status anew: twice a second and on change, whatever the requests."""

@@ -47,8 +47,13 @@ class OffboardStream:
         self.echo: tuple[Sequence[float], float, Triple] = (_LEVEL, 0.0, _NO_RATES)
         self._last_us: int | None = None
 
+    @property
+    def newest_us(self) -> int | None:
+        """Return when the newest setpoint came that proves a stream; None before the first."""
+        return self._last_us
+
     def age_us(self, now_us: int) -> float:
-        """Return the age of the newest setpoint that proves a stream; infinite before the first."""
+        """Return the age of that setpoint; infinite before the first."""
         return math.inf if self._last_us is None else now_us - self._last_us
 
     def take(

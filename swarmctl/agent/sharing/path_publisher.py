@@ -111,6 +111,10 @@ class PathPublisher:
             self._stop_judge.forget()
             self._flown = flown, self._ports.clock.now_us() + self._delay_us
             t0_us, dt_us, pos = flown.t0_us, flown.dt_us, flown.pos_ned_m
+            heard_us = self._ports.autopilot.unheard_since_us(self._ports.clock.now_us())
+            if heard_us is not None:
+                pos, apart_m = self._unheard(state, flown, heard_us)
+                margin_m += apart_m
         else:
             now_us = self._ports.clock.now_us()
             t0_us, dt_us = now_us + self._delay_us, self._dt_us
@@ -147,6 +151,28 @@ class PathPublisher:
         plan, last_us = self._flown
         half = 0.5 * (predict_after_setpoints(plan, last_us, self._ahead_s(t0_us, last_us), **limits) - deaf)
         soon = half[: 1 + round(_DOUBT_US / self._dt_us)]
+        return deaf + half, math.sqrt(float((soon * soon).sum(axis=1).max()))
+
+    def _unheard(self, state: VehicleState, flown: Plan, heard_us: int) -> tuple[Array, float]:
+        """Return positions (N, 3), NED [m], of a vehicle that misses setpoints, and how far it may be off [m].
+
+        It keeps its attitude until it hears one or its autopilot takes over. The middle between that way and the plan
+        is returned, and what is between them while the attitude is kept.
+        """
+        keeps_s, coasts_s = self._ports.autopilot.setpoint_loss_s, self._ports.autopilot.landing_delay_s
+        if keeps_s is None or coasts_s is None:
+            return flown.pos_ned_m, 0.0
+        kept_s = (state.t_us - heard_us) * 1e-6
+        ahead_s = grid(len(flown.pos_ned_m) - 1) * (flown.dt_us * 1e-6) + (flown.t0_us - state.t_us) * 1e-6
+        deaf = predict_without_setpoints(
+            state,
+            ahead_s,
+            keeps_s=max(0.0, keeps_s - kept_s),
+            coasts_s=max(0.0, coasts_s - kept_s),
+            brake_m_s2=self._setup.separation.brake_m_s2,
+        )
+        half = 0.5 * (flown.pos_ned_m - deaf)
+        soon = half[: 1 + round(_DOUBT_US / flown.dt_us)]
         return deaf + half, math.sqrt(float((soon * soon).sum(axis=1).max()))
 
     def _ahead_s(self, t0_us: int, since_us: int) -> Array:

@@ -27,7 +27,7 @@ class VehicleWatch:
     def __init__(self, ports: Ports, alerts: Alerts) -> None:
         self._ports, self._alerts, self.accuracy = ports, alerts, AccuracyLoss()
         self._gaps = self._jumps = 0  # already reported
-        self._is_lost = False  # as reported
+        self._is_lost = self._is_deaf = False  # as reported
         self._no_origin_us: int | None = None  # since when the vehicle does not tell its origin
 
     def on_result(self, result: CommandResult, now_us: int) -> None:
@@ -82,6 +82,15 @@ class VehicleWatch:
         if is_lost != self._is_lost:
             self._is_lost = is_lost
             self._ports.note("position_lost", lost=is_lost)
+
+    def report_unheard(self, now_us: int) -> None:
+        """Report that the vehicle does not hear its setpoints, although they are sent and its states are heard."""
+        is_deaf = self._ports.autopilot.unheard_since_us(now_us) is not None
+        if is_deaf:
+            self._alerts.put("unheard", "the vehicle does not hear its setpoints: its link fails one way", now_us)
+        if is_deaf != self._is_deaf:
+            self._is_deaf = is_deaf
+            self._ports.note("setpoints_unheard", unheard=is_deaf)
 
     def report_gap(self, now_us: int, cause: str) -> None:
         """Report that setpoints had stopped for too long, if they had; the cause is "" where it is not known."""

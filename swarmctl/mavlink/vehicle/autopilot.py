@@ -195,6 +195,13 @@ class Autopilot:
         """Return the time after which the autopilot brakes and lands when it hears nothing; None until it has told."""
         return None if self.dialect is None else self.params.get(self.dialect.landing_parameter)
 
+    def unheard_since_us(self, now_us: int) -> int | None:
+        """Return when the last setpoint was sent that the vehicle is known to fly, if it misses those after it."""
+        sample = self.states.newest
+        if sample is None or self.mode is not FlightMode.EXTERNAL:
+            return None
+        return self.setpoints.heard.unheard_since_us(now_us, sample.t_us)
+
     def close(self) -> None:
         self._transport.close()
 
@@ -302,6 +309,7 @@ class Autopilot:
     def _timesync(self, message: Any, arrived_us: int) -> None:
         if message.tc1 > 0 and message.ts1 in self._syncs:
             self._syncs.remove(message.ts1)
+            self.setpoints.heard.round_trip_us = arrived_us - message.ts1 // 1000
             self.clock.round_trip(message.ts1 // 1000, message.tc1 // 1000, arrived_us)
 
     def _estimator(self, message: Any, arrived_us: int) -> None:
@@ -336,7 +344,8 @@ class Autopilot:
             self.hover_thrust_01 = value
 
     def _attitude_target(self, message: Any, arrived_us: int) -> None:
-        """Learn the hover thrust while the autopilot hovers by itself: in HOLD, or where take-off shares our mode."""
+        """Note which setpoint is flown; learn the hover thrust in HOLD, or where take-off shares our mode."""
+        self.setpoints.heard.repeated(message.thrust, arrived_us)
         if self.landed is Landed.IN_AIR and 0.05 < message.thrust < 1.0 and self._hovers_by_itself(arrived_us):
             self.hover_thrust_01 = message.thrust
 

@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import development as mavlink
 from swarmctl.core.mavlink_values import AUTOPILOT_COMPID
 from swarmctl.core.types import AttitudeSetpoint
 from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.vehicle.heard_setpoints import HeardSetpoints
 
 _ATTITUDE_ONLY = 7  # type_mask that ignores body rates; with mask 0 rate and attitude setpoints would compete
 _SETPOINT = struct.Struct("<I4f3ff3B")  # SET_ATTITUDE_TARGET, without the thrust of other axes
@@ -26,6 +27,7 @@ class SetpointStream:
     Attributes:
         refused: number of setpoints that were not sent, because they were not valid.
         sent_us: time of the newest one; None before the first.
+        heard: which of them the vehicle flies.
         gaps: number of pauses so long that the autopilot's failsafe may have acted unseen; `gap_s`: the newest.
     """
 
@@ -33,6 +35,7 @@ class SetpointStream:
         self._codec, self._sysid, self._send_frame = codec, sysid, send_frame
         self.refused = 0
         self.sent_us: int | None = None
+        self.heard = HeardSetpoints()
         self.gaps, self.gap_s = 0, 0.0
         self._departures = 0  # count of departures from the external mode at the newest setpoint
 
@@ -53,6 +56,7 @@ class SetpointStream:
         whom_and_what = self._sysid, AUTOPILOT_COMPID, _ATTITUDE_ONLY
         payload = _SETPOINT.pack(stamp_ms, *q_nb, 0.0, 0.0, 0.0, setpoint.thrust_01, *whom_and_what)
         self._measure_gap(now_us, loss_s, departures)
+        self.heard.sent(now_us, setpoint.thrust_01)
         self._send_frame(self._codec.frame(mavlink.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET, payload))
         return ""
 
