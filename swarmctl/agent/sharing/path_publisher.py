@@ -12,7 +12,9 @@ from swarmctl.agent.sharing.path_sharing import PathSharing
 from swarmctl.bus import topics
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.constant_velocity import (
+    STEERED_MARGIN_M,
     StopJudge,
+    is_steered,
     predict_after_setpoints,
     predict_constant_velocity,
     predict_without_setpoints,
@@ -121,6 +123,7 @@ class PathPublisher:
             if self._is_recent(state):
                 stops, ahead_s = self._stop_judge.update(state), self._ahead_s(t0_us, state.t_us)
                 pos = predict_constant_velocity(state, ahead_s, self._setup.separation.brake_m_s2, stops=stops)
+                margin_m += 0.0 if stops or not is_steered(state) else STEERED_MARGIN_M
             else:
                 pos, apart_m = self._without_link(state, t0_us)
                 age_s = (now_us - state.t_us) * 1e-6  # as much as peers keep from a path of this age:

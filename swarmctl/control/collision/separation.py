@@ -16,13 +16,15 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.collision.budget import SeparationBudget
+from swarmctl.core.autopilot_stop import without_setpoints_ned_m
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
 from swarmctl.core.trajectory import Polylines, braking_displacement, braking_displacements, grid, interpolated
 from swarmctl.core.types import Array, PredictedPath
 
 _TINY_M = 1e-6
-_KEEPS_US = 600_000  # COM_OF_LOSS_T, which agents set to 0.5 s, and the time that the vehicle takes to level
+_KEEPS_S = 0.5  # COM_OF_LOSS_T, as agents set it
+_STOPS_US = 2_500_000  # until then the way without setpoints is told, after which little is left of its speed
 _MOST_M_S2 = 5.0  # of a kept acceleration: points are rounded, and second differences are sensitive to it
 _APPROACH_TOLERANCE_M = 0.02  # approach allowed in a whole encounter with a keep-out that is violated already
 
@@ -203,13 +205,16 @@ def without_setpoints(path: PredictedPath) -> PredictedPath:
     Its autopilot keeps the last attitude for a while, so the level acceleration of the first points goes on, instead of
     what was planned to follow. Where the returned path ends the autopilot brakes, as beyond the end of any path.
     """
-    first, second = path.pos_ned_m[:2]
+    dt_s, (first, second) = path.dt_us * 1e-6, path.pos_ned_m[:2]
     bend = path.pos_ned_m[2] - 2.0 * second + first if len(path.pos_ned_m) > 2 else np.zeros(3)
     bend[2] = 0.0
-    most_m, size_m = _MOST_M_S2 * (path.dt_us * 1e-6) ** 2, math.hypot(bend[0], bend[1])
+    most_m, size_m = _MOST_M_S2 * dt_s**2, math.hypot(bend[0], bend[1])
     bend *= most_m / max(size_m, most_m)
-    k = grid(max(1, round(_KEEPS_US / path.dt_us)))[:, None]
-    return replace(path, pos_ned_m=first + k * (second - first) + 0.5 * k * (k - 1.0) * bend)
+    accel = bend / dt_s**2
+    vel = (second - first) / dt_s - 0.5 * dt_s * accel  # at the first point
+    ahead_s = grid(max(1, round(_STOPS_US / path.dt_us))) * dt_s
+    pos = without_setpoints_ned_m(first, vel, accel, ahead_s, keeps_s=_KEEPS_S, coasts_s=_KEEPS_S)
+    return replace(path, pos_ned_m=pos)
 
 
 def keep_out_of_peer(

@@ -1,4 +1,4 @@
-"""Prediction of a vehicle that its autopilot or a pilot flies: constant velocity, or braking where it comes to rest."""
+"""Prediction of a vehicle that its autopilot or a pilot flies: straight on, or braking where it comes to rest."""
 
 from __future__ import annotations
 
@@ -7,27 +7,42 @@ from collections import deque
 
 import numpy as np
 
+from swarmctl.core.autopilot_stop import BRAKE_M_S2, HOLD_BRAKE_M_S2, settling_displacement, without_setpoints_ned_m
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
-from swarmctl.core.trajectory import braking_displacement, interpolated
+from swarmctl.core.trajectory import interpolated
 from swarmctl.core.types import Array, FlightMode, Plan, VehicleState
 
 CREEP_M_S = 0.5  # a slower vehicle in hold is taken to rest: estimates of hovering ones wander as fast
-_ENTERS_US = 1_000_000  # time in hold for which it is taken to brake, whatever its speed does
+STEERED_MARGIN_M = 0.3  # beside a vehicle that is steered: nobody knows where to
+_ENTERS_US = 200_000  # time in hold for which it is taken to brake, whatever its speed does
+_STEERED = (FlightMode.HOLD, FlightMode.MANUAL)
+_STEERED_S = 0.4  # for which a tilt is kept there
 _WINDOW_US = 400_000  # over which speeds are compared after that
 _LEAST_COS = 0.5  # of a tilt that is kept
-_BRAKES_M_S = 0.2  # by which the speed of one that brakes falls in that time; PX4 brakes at 3 m/s2
+_BRAKES_M_S = 0.2  # by which the speed of one that brakes falls in that time
 
 
 def predict_constant_velocity(state: VehicleState, ahead_s: Array, brake_m_s2: float, *, stops: bool) -> Array:
     """Return positions (N, 3), NED [m], at `ahead_s` (N,) after a state.
 
-    The velocity is continued, or reduced at `brake_m_s2` where the vehicle `stops`.
+    The velocity is reduced where the vehicle `stops`, as autopilots do but at `brake_m_s2` at most. Otherwise it is
+    continued; where somebody steers, it changes as the tilt says first.
     """
+    ahead_s = np.maximum(ahead_s, 0.0)
     if stops:
-        speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
-        t_s = np.minimum(ahead_s, speed / brake_m_s2)
-        ahead_s = t_s - 0.5 * brake_m_s2 * t_s * t_s / max(speed, 1e-6)  # time to travel as far at the present speed
-    return np.asarray(state.pos_ned_m + ahead_s[:, None] * state.vel_ned_m_s)
+        brake_m_s2 = min(brake_m_s2, HOLD_BRAKE_M_S2 if state.mode is FlightMode.HOLD else BRAKE_M_S2)
+        motion = (state.vel_ned_m_s, _level_accel_ned_m_s2(state))
+        return state.pos_ned_m + settling_displacement(*motion, ahead_s, brake_m_s2=brake_m_s2)
+    pos = state.pos_ned_m + ahead_s[:, None] * state.vel_ned_m_s
+    if is_steered(state):
+        steered_s = np.minimum(ahead_s, _STEERED_S)
+        pos += (steered_s * (ahead_s - 0.5 * steered_s))[:, None] * _level_accel_ned_m_s2(state)
+    return np.asarray(pos)
+
+
+def is_steered(state: VehicleState) -> bool:
+    """Return whether a pilot or a ground station may be steering the vehicle, unless it stops."""
+    return state.mode in _STEERED and _speed_m_s(state) >= CREEP_M_S
 
 
 def predict_without_setpoints(
@@ -38,10 +53,8 @@ def predict_without_setpoints(
     Its autopilot keeps the attitude for `keeps_s`, which accelerates it in the plane, levels and coasts on until
     `coasts_s`, and then brakes and lands.
     """
-    tilt_ned = body_z_ned(state.q_nb)
-    accel_ned_m_s2 = np.append(-GRAVITY_M_S2 / max(_LEAST_COS, tilt_ned[2]) * tilt_ned[:2], 0.0)
-    motion = (state.pos_ned_m, state.vel_ned_m_s, accel_ned_m_s2)
-    return _kept(motion, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)
+    motion = (state.pos_ned_m, state.vel_ned_m_s, _level_accel_ned_m_s2(state))
+    return without_setpoints_ned_m(*motion, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)
 
 
 def predict_after_setpoints(
@@ -58,21 +71,17 @@ def predict_after_setpoints(
     accel_ned_m_s2 = (plan.vel_ned_m_s[begun + 1] - plan.vel_ned_m_s[begun]) / (plan.dt_us * 1e-6)
     accel_ned_m_s2[2] = 0.0
     motion = (pos, vel, accel_ned_m_s2)
-    return _kept(motion, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)
+    return without_setpoints_ned_m(*motion, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)
 
 
-def _kept(
-    motion: tuple[Array, Array, Array], ahead_s: Array, *, keeps_s: float, coasts_s: float, brake_m_s2: float
-) -> Array:
-    """Continue a position, velocity and acceleration, all (3,) NED: keep the acceleration, coast, and brake."""
-    pos_ned_m, vel_ned_m_s, accel_ned_m_s2 = motion
-    keeps_s = min(keeps_s, coasts_s)
-    kept_s, later_s = np.minimum(ahead_s, keeps_s)[:, None], np.maximum(ahead_s - keeps_s, 0.0)
-    coasting_ned_m_s = vel_ned_m_s + keeps_s * accel_ned_m_s2
-    coasted_s = np.minimum(later_s, coasts_s - keeps_s)[:, None]
-    braked_ned_m = braking_displacement(coasting_ned_m_s, ahead_s - coasts_s, brake_m_s2)
-    kept_ned_m = kept_s * vel_ned_m_s + 0.5 * kept_s**2 * accel_ned_m_s2
-    return np.asarray(pos_ned_m + kept_ned_m + coasted_s * coasting_ned_m_s + braked_ned_m)
+def _speed_m_s(state: VehicleState) -> float:
+    return math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
+
+
+def _level_accel_ned_m_s2(state: VehicleState) -> Array:
+    """Return the acceleration (3,) in the plane that an attitude gives to a vehicle that keeps its height."""
+    tilt_ned = body_z_ned(state.q_nb)
+    return np.append(-GRAVITY_M_S2 / max(_LEAST_COS, tilt_ned[2]) * tilt_ned[:2], 0.0)
 
 
 class StopJudge:
@@ -91,7 +100,7 @@ class StopJudge:
         if state.mode is not FlightMode.HOLD:
             self.forget()
             return state.mode is FlightMode.LAND
-        t_us, speed_m_s = state.t_us, math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
+        t_us, speed_m_s = state.t_us, _speed_m_s(state)
         self._held_since_us = t_us if self._held_since_us is None else self._held_since_us
         self._recent.append((t_us, speed_m_s))
         while t_us - self._recent[0][0] > _WINDOW_US:

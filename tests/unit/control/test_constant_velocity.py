@@ -14,48 +14,88 @@ from swarmctl.control.estimation.constant_velocity import (
     predict_constant_velocity,
     predict_without_setpoints,
 )
+from swarmctl.core.autopilot_stop import ANSWER_S, BRAKE_M_S2, HOLD_BRAKE_M_S2
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_euler
 from swarmctl.core.types import FlightMode, Plan, PlanStatus
 from tests import builders
 
-BRAKE_M_S2 = 2.0
+SEEN_AFTER_S = 0.05  # that no setpoint comes
 AHEAD_S = np.arange(0.0, 3.01, 0.1)
 STATE = builders.vehicle_state(
     pos_ned_m=np.array([1.0, 2.0, -3.0]), vel_ned_m_s=np.array([2.0, 0.0, 0.0]), mode=FlightMode.MANUAL
 )
 
 
-def test_under_a_pilot_the_velocity_is_continued() -> None:
+def test_under_a_pilot_the_velocity_is_continued_after_it_has_changed_as_the_tilt_says() -> None:
     assert predict_constant_velocity(STATE, AHEAD_S, BRAKE_M_S2, stops=False)[-1] == pytest.approx([7.0, 2.0, -3.0])
+    tilted = replace(STATE, q_nb=quat_from_euler(0.0, -np.arctan(0.1), 0.0))
+    gained_m = 0.1 * GRAVITY_M_S2 * (0.5 * 0.4**2 + 0.4 * 2.6)
+    assert predict_constant_velocity(tilted, AHEAD_S, 9.0, stops=False)[-1, 0] == pytest.approx(7.0 + gained_m)
+    climbs = replace(tilted, mode=FlightMode.TAKEOFF)
+    assert predict_constant_velocity(climbs, AHEAD_S, 9.0, stops=False)[-1, 0] == pytest.approx(7.0)
 
 
-def test_braking_is_predicted_of_who_stops() -> None:
-    """From 2 m/s at 2 m/s2 it stops after 1 s and 1 m."""
-    pos = predict_constant_velocity(STATE, AHEAD_S, BRAKE_M_S2, stops=True)
-    assert pos[10:] == pytest.approx(np.tile([2.0, 2.0, -3.0], (len(AHEAD_S) - 10, 1)))
-    assert pos[5] == pytest.approx([1.75, 2.0, -3.0]), "1 m/s left"
-    resting = replace(STATE, vel_ned_m_s=np.zeros(3))
+def integrated_m(
+    vel_m_s: float, phases: Sequence[tuple[float, float]], *, accel_m_s2: float, until_s: float
+) -> tuple[float, float]:
+    """Return way and speed of a motion whose acceleration approaches one after another, (begin, acceleration) each."""
+    step_s, way_m, t_s = 1e-4, 0.0, 0.0
+    while t_s < until_s and vel_m_s > 0.0:
+        goal_m_s2 = next((goal for begin_s, goal in reversed(phases) if t_s >= begin_s), accel_m_s2)
+        accel_m_s2 += (goal_m_s2 - accel_m_s2) / ANSWER_S * step_s
+        vel_m_s += accel_m_s2 * step_s
+        way_m += vel_m_s * step_s
+        t_s += step_s
+    return way_m, vel_m_s
+
+
+@pytest.mark.parametrize("speed_m_s", [0.5, 2.0, 4.0])
+@pytest.mark.parametrize("accel_m_s2", [-2.0, 0.0, 2.0])
+@pytest.mark.parametrize("mode", [FlightMode.LAND, FlightMode.HOLD])
+def test_who_stops_turns_its_acceleration_into_braking(speed_m_s: float, accel_m_s2: float, mode: FlightMode) -> None:
+    q_nb = quat_from_euler(0.0, -np.arctan(accel_m_s2 / GRAVITY_M_S2), 0.0)
+    state = replace(STATE, vel_ned_m_s=np.array([speed_m_s, 0.0, 0.0]), q_nb=q_nb, mode=mode)
+    brake_m_s2 = HOLD_BRAKE_M_S2 if mode is FlightMode.HOLD else BRAKE_M_S2
+    way_m = (predict_constant_velocity(state, AHEAD_S, 9.0, stops=True) - STATE.pos_ned_m) @ [1.0, 0.0, 0.0]
+    for ahead_s, reached_m in zip(AHEAD_S[::5], way_m[::5], strict=True):
+        expected_m, _ = integrated_m(speed_m_s, [(0.0, -brake_m_s2)], accel_m_s2=accel_m_s2, until_s=ahead_s)
+        assert reached_m == pytest.approx(expected_m, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("speed_m_s", "measured_m"),
+    [(0.77, 0.32), (2.11, 1.48), (3.37, 2.83), (1.03, 0.50), (1.90, 1.15), (3.97, 4.1)],
+)
+def test_ways_to_rest_are_those_of_real_autopilots_that_land(speed_m_s: float, measured_m: float) -> None:
+    state = replace(STATE, vel_ned_m_s=np.array([speed_m_s, 0.0, 0.0]), mode=FlightMode.LAND)
+    way_m = predict_constant_velocity(state, np.array([9.0]), 9.0, stops=True)[0, 0] - STATE.pos_ned_m[0]
+    assert 0.85 * measured_m < way_m < 1.35 * measured_m
+
+
+def test_who_brakes_more_softly_is_taken_to() -> None:
+    way_m = predict_constant_velocity(STATE, np.array([9.0]), 1.0, stops=True)[0, 0] - STATE.pos_ned_m[0]
+    assert way_m == pytest.approx(2.0 * ANSWER_S + 2.0, abs=0.05)
+
+
+def test_who_rests_is_predicted_to_rest() -> None:
+    resting = replace(STATE, vel_ned_m_s=np.zeros(3), mode=FlightMode.HOLD)
     assert predict_constant_velocity(resting, AHEAD_S, BRAKE_M_S2, stops=True) == pytest.approx(
         np.tile(STATE.pos_ned_m, (len(AHEAD_S), 1))
     )
 
 
-def test_who_hears_nothing_keeps_its_tilt_then_coasts_and_then_brakes() -> None:
-    """By g/10 for 1 s, straight on until 2 s, and at 2 m/s2 to rest: ArduCopter by configs/ardupilot_sitl.toml."""
+@pytest.mark.parametrize(("keeps_s", "coasts_s"), [(1.0, 2.0), (0.5, 0.5), (1.0, 0.5)])
+def test_who_hears_nothing_keeps_its_tilt_then_coasts_and_then_brakes(keeps_s: float, coasts_s: float) -> None:
+    """By g/10, as an ArduCopter does (configs/ardupilot_sitl.toml), a PX4, and who lands before it levels."""
     accel_m_s2 = 0.1 * GRAVITY_M_S2
     tilted = replace(STATE, q_nb=quat_from_euler(0.0, -np.arctan(0.1), 0.0), mode=FlightMode.EXTERNAL)
-    ahead_s = np.array([0.0, 1.0, 2.0, 2.5, 9.0])
-    pos = predict_without_setpoints(tilted, ahead_s, keeps_s=1.0, coasts_s=2.0, brake_m_s2=BRAKE_M_S2)
-    speed_m_s = 2.0 + accel_m_s2
-    way_m = np.array([0.0, 2.0 + 0.5 * accel_m_s2, 4.0 + 1.5 * accel_m_s2, 0.0, 0.0])
-    way_m[3:] = way_m[2] + np.array([0.5 * speed_m_s - 0.25, 0.25 * speed_m_s**2])
-    assert pos == pytest.approx(STATE.pos_ned_m + np.outer(way_m, [1.0, 0.0, 0.0]))
-
-
-def test_who_lands_before_it_levels_brakes_from_the_tilt_it_has() -> None:
-    level = replace(STATE, mode=FlightMode.EXTERNAL)
-    pos = predict_without_setpoints(level, AHEAD_S, keeps_s=1.0, coasts_s=0.5, brake_m_s2=BRAKE_M_S2)
-    assert pos[[5, 30]] == pytest.approx(STATE.pos_ned_m + np.outer([1.0, 2.0], [1.0, 0.0, 0.0]))
+    pos = predict_without_setpoints(tilted, AHEAD_S, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=BRAKE_M_S2)
+    kept_s, coasted_s = min(keeps_s, coasts_s) + SEEN_AFTER_S, coasts_s + SEEN_AFTER_S
+    phases = [(kept_s, 0.0 if coasted_s > kept_s else -BRAKE_M_S2), (coasted_s, -BRAKE_M_S2)]
+    for ahead_s, reached_m in zip(AHEAD_S[::5], (pos - STATE.pos_ned_m)[::5, 0], strict=True):
+        expected_m, _ = integrated_m(2.0, phases, accel_m_s2=accel_m_s2, until_s=ahead_s)
+        assert reached_m == pytest.approx(expected_m, abs=0.03)
+    assert pos[:, 1:] == pytest.approx(np.tile(STATE.pos_ned_m[1:], (len(pos), 1)))
 
 
 def test_who_has_followed_a_plan_keeps_the_acceleration_that_it_had_there() -> None:
@@ -70,10 +110,12 @@ def test_who_has_followed_a_plan_keeps_the_acceleration_that_it_had_there() -> N
         vel_ned_m_s=2.0 * t_s * north,
         virtual_control=np.zeros((5, 3)),
     )
-    ahead_s = np.array([0.0, 1.0, 2.0])
+    ahead_s = np.array([0.0, 1.0, 3.0])
     pos = predict_after_setpoints(plan, 1_250_000, ahead_s, keeps_s=1.0, coasts_s=9.0, brake_m_s2=BRAKE_M_S2)
-    begun_m = 0.065  # half way between two points of the plan
-    assert pos == pytest.approx(np.outer([begun_m, begun_m + 1.5, begun_m + 4.0], north))
+    begun_m, kept_s = 0.065, 1.0 + SEEN_AFTER_S  # half way between two points of the plan
+    levelled_m_s = 0.5 + 2.0 * (kept_s + ANSWER_S)
+    last_m = 0.5 * kept_s + kept_s**2 + levelled_m_s * (3.0 - kept_s) - 2.0 * ANSWER_S**2
+    assert pos == pytest.approx(np.outer([begun_m, begun_m + 1.5, begun_m + last_m], north), abs=1e-3)
 
 
 def judged(mode: FlightMode, speeds_m_s: Sequence[float]) -> list[bool]:
@@ -86,7 +128,7 @@ def judged(mode: FlightMode, speeds_m_s: Sequence[float]) -> list[bool]:
 
 
 def test_who_enters_hold_stops_and_who_is_moved_in_it_does_not() -> None:
-    assert judged(FlightMode.HOLD, [3.0] * 30) == [True] * 10 + [False] * 20
+    assert judged(FlightMode.HOLD, [3.0] * 30) == [True] * 2 + [False] * 28
     braking = [3.0] * 11 + [3.0 - 0.1 * k for k in range(25)]
     assert judged(FlightMode.HOLD, braking)[-22:] == [True] * 22
     assert judged(FlightMode.HOLD, [0.0] * 20 + [1.0] * 10)[20:] == [False] * 10, "moved away from where it hovered"

@@ -1,0 +1,74 @@
+"""How a vehicle moves that gets no setpoint any more: its autopilot keeps the attitude, may coast, and brakes to rest.
+
+Autopilots begin to brake late, and brake softly. True ways to rest of a PX4 1.18 (MPC_ACC_HOR = 3 m/s2) in LAND were
+0.3, 1.5 and 2.8 m from 0.8, 2.1 and 3.4 m/s, of an ArduCopter 4.6.3 0.5, 1.2 and 4.1 m from 1.0, 1.9 and 4.0 m/s. Here
+they are 0.3, 1.6 and 3.6, 0.5, 1.3 and 4.9 m; braking at once at 3 m/s2 gives 0.1, 0.7 and 1.9, 0.2, 0.6 and 2.6 m. In
+hold they need longer: 1.9 m from 2.1 m/s (PX4), 2.5 m from 2.0 m/s (BRAKE of ArduCopter).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from swarmctl.core.types import Array
+
+BRAKE_M_S2 = 2.0  # on average, until it rests
+HOLD_BRAKE_M_S2 = 1.5
+ANSWER_S = 0.25  # in which an acceleration becomes another one, but for 1/e of it
+_AT_REST_M_S = 1e-6  # a slower velocity has no direction
+_SEEN_AFTER_S = 0.05  # that a setpoint is missing: PX4 looks for it every 0.1 s
+
+
+def without_setpoints_ned_m(
+    pos_ned_m: Array,
+    vel_ned_m_s: Array,
+    accel_ned_m_s2: Array,
+    ahead_s: Array,
+    *,
+    keeps_s: float,
+    coasts_s: float,
+    brake_m_s2: float = BRAKE_M_S2,
+) -> Array:
+    """Return positions (N, 3), NED [m], at `ahead_s` (N,) after a vehicle has got its last setpoint.
+
+    Args:
+        pos_ned_m, vel_ned_m_s, accel_ned_m_s2: (3,) its motion at that time.
+        ahead_s: (N,) times.
+        keeps_s: so long its autopilot keeps the attitude, and thus the acceleration.
+        coasts_s: from then until this time it flies level; the same value where it brakes at once.
+        brake_m_s2: braking; more than autopilots do is taken for what they do.
+    """
+    coasts_s, keeps_s = coasts_s + _SEEN_AFTER_S, min(keeps_s, coasts_s) + _SEEN_AFTER_S
+    kept_s, later_s = np.minimum(ahead_s, keeps_s)[:, None], np.maximum(ahead_s - keeps_s, 0.0)
+    pos = pos_ned_m + kept_s * vel_ned_m_s + 0.5 * kept_s**2 * accel_ned_m_s2
+    vel, accel = vel_ned_m_s + keeps_s * accel_ned_m_s2, accel_ned_m_s2
+    level_s = coasts_s - keeps_s
+    if level_s > 0.0:
+        pos += settling_displacement(vel, accel, np.minimum(later_s, level_s), brake_m_s2=0.0)
+        left_01 = math.exp(-level_s / ANSWER_S)
+        vel, accel = vel + ANSWER_S * (1.0 - left_01) * accel, left_01 * accel
+        later_s = np.maximum(later_s - level_s, 0.0)
+    return np.asarray(pos + settling_displacement(vel, accel, later_s, brake_m_s2=min(brake_m_s2, BRAKE_M_S2)))
+
+
+def settling_displacement(vel_ned_m_s: Array, accel_ned_m_s2: Array, t_s: Array, *, brake_m_s2: float) -> Array:
+    """Return displacements (N, 3) NED [m] at `t_s` (N,) after the autopilot has taken over, until the vehicle rests.
+
+    Its acceleration approaches exponentially, as its attitude does, a deceleration against the velocity that it will
+    have by then; 0: it flies on level.
+
+    Args:
+        vel_ned_m_s, accel_ned_m_s2: (3,) its motion when the autopilot takes over.
+        t_s: (N,) times, >= 0.
+        brake_m_s2: the deceleration.
+    """
+    settled = vel_ned_m_s + ANSWER_S * accel_ned_m_s2  # but for the braking meanwhile
+    speed = math.sqrt(float(settled @ settled))
+    goal = settled * (-brake_m_s2 / speed) if speed >= _AT_REST_M_S else np.zeros(3)
+    if brake_m_s2 > 0.0:
+        t_s = np.minimum(t_s, ANSWER_S + speed / brake_m_s2)
+    t = t_s[:, None]
+    lagging_s = ANSWER_S * (t + ANSWER_S * np.expm1(-t / ANSWER_S))  # s2: of an acceleration that goes
+    return np.asarray(t * vel_ned_m_s + lagging_s * accel_ned_m_s2 + (0.5 * t * t - lagging_s) * goal)
