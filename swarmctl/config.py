@@ -245,8 +245,13 @@ def load(
     return config
 
 
-def load_mission(config: Config, path: Path) -> MissionParams:
+def load_mission(config: Config, path: Path, obstacles: Mapping[int, Obstacle] | None = None) -> MissionParams:
     """Read a file that holds `[mission]` alone, and check it for a swarm that flies already.
+
+    Args:
+        config: of the swarm.
+        path: of the file.
+        obstacles: those that are there now, by number; None: those of the configuration.
 
     Raises:
         ConfigError: it can't be flown; lists all problems.
@@ -264,7 +269,8 @@ def load_mission(config: Config, path: Path) -> MissionParams:
         raise ConfigError(source, [f"mission.kind = {changed.mission.kind!r}: {own}"])
     mission = changed.mission
     problems = [*mission.kind_problems(), *mission.problems(config.swarm.agents), *_infeasible(changed)]
-    problems = problems or list(obstacle_problems(changed.obstacles, (), changed.goals_ned_m(), from_ground=False))
+    there = dict(enumerate(changed.obstacles)) if obstacles is None else obstacles
+    problems = problems or list(obstacle_problems(there, (), changed.goals_ned_m(), from_ground=False))
     if problems:
         raise ConfigError(source, problems)
     return mission
@@ -342,9 +348,8 @@ def _start_problems(config: Config) -> Iterator[str]:
     elif not (listed and listed < agents):
         yield from starts_apart(config.starts_ned_m(), config.separation, config.sitl)
         from_ground = not config.sitl.enabled or config.sitl.start == "ground"
-        yield from obstacle_problems(
-            config.obstacles, config.starts_ned_m(), config.goals_ned_m(), from_ground=from_ground
-        )
+        numbered = dict(enumerate(config.obstacles))
+        yield from obstacle_problems(numbered, config.starts_ned_m(), config.goals_ned_m(), from_ground=from_ground)
         yield from config.geofence.problems(config.starts_ned_m())
         yield from volume_problems(
             config.volume, config.geofence, config.controller, config.separation, config.starts_ned_m(), config.drift_m

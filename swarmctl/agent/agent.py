@@ -37,6 +37,7 @@ from swarmctl.agent.tick_results import ControlOutput, PlanningResult
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.agent.watches.controller_watch import ControllerWatch
 from swarmctl.agent.watches.deadline_watch import DeadlineWatch
+from swarmctl.agent.watches.destination_watch import DestinationWatch
 from swarmctl.agent.watches.vehicle_watch import VehicleWatch
 from swarmctl.control.failsafe.overload import Level
 from swarmctl.control.phases.inputs import PhaseInputs
@@ -88,6 +89,7 @@ class Agent:
         self._controller_watch = ControllerWatch(own, ports.note)
         self._deadlines = DeadlineWatch(setup.params.overload, setup.params.rate_hz, alerts, ports.note)
         self._orders = OperatorOrders(setup, ports, self._world_model, self._state_machine, alerts=alerts)
+        self._destination = DestinationWatch(self._mission, self._world_model.obstacles, alerts, ports.note)
         self._start_conditions = StartConditions(setup, self._mission, alerts)
         self._mission_end = MissionEnd(ports, self._mission, self._vehicle_setup, alerts)
 
@@ -329,6 +331,7 @@ class Agent:
             self._alerts.put("override", mission.outcome, now_us)
         self._start_conditions.compare_heights(now_us, state, self._world_model.standing_m)
         self._start_conditions.report(now_us)
+        self._destination.update(now_us)
         self._mission_end.step(now_us)
         self._vehicle_setup.step(now_us)
         if mission.had_control and not controlled:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from swarmctl.agent.setup import AgentParams
 from swarmctl.agent.sharing.path_sharing import PathSharingParams
@@ -160,14 +160,17 @@ def starts_apart(
 
 
 def obstacle_problems(
-    obstacles: Sequence[Obstacle],
+    obstacles: Mapping[int, Obstacle],
     starts_ned_m: Sequence[Sequence[float]],
     goals_ned_m: Sequence[Sequence[float] | None],
     *,
     from_ground: bool,
 ) -> Iterator[str]:
-    """Yield which agents would wait in an obstacle or take off through it, and whose goal is in one at rest."""
-    for i, obstacle in enumerate(obstacles):
+    """Yield which agents would wait in an obstacle or take off through it, and whose goal is in one at rest.
+
+    The obstacles are those by number.
+    """
+    for i, obstacle in obstacles.items():
         goals = () if obstacle.moves else goals_ned_m
         placed = [(f"agent {k} would wait", obstacle.distance_m(start)) for k, start in enumerate(starts_ned_m)]
         placed += [

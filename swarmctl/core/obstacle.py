@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -88,3 +88,12 @@ class Obstacle(Params):
     def center_after(self, elapsed_s: float | NDArray[np.floating]) -> Array:
         """Return the centre NED [m] after a time, (3,), or (T, 3) after times (T, 1), at constant velocity."""
         return np.array(self.center_ned_m) + elapsed_s * np.array(self.vel_ned_m_s)
+
+
+def taken_by(place_ned_m: Array | Sequence[float], obstacles: Mapping[int, Obstacle]) -> str:
+    """Return in words which obstacle, by number, has a place (3,) in its keep-out; "" if none has."""
+    for number, obstacle in obstacles.items():
+        if (away_m := obstacle.distance_m(place_ned_m)) < obstacle.keep_out_m:
+            away = f"{away_m:.2f} m from its {'axis' if obstacle.column else 'centre'}"
+            return f"the keep-out of obstacle {number}, {away} (keep_out_m = {obstacle.keep_out_m:g})"
+    return ""

@@ -130,7 +130,8 @@ class Flight:
 
     def ask(self, verb: str, **arguments: float) -> str:
         """Give an operator's order; return why it is refused, or ""."""
-        return self.state_machine.operator(Order(verb, arguments), self.now_us, self.utc_us, self.state)
+        obstacles = dict(enumerate(self.obstacles))
+        return self.state_machine.operator(Order(verb, arguments), self.now_us, self.utc_us, self.state, obstacles)
 
     def until(self, phase: Phase) -> Flight:
         """Continue without faults until a phase is reached."""

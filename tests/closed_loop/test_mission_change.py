@@ -11,6 +11,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
 from swarmctl.bus.messages.json_messages import encode_message
 from swarmctl.config import Config, load, load_mission
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import BEGIN, MISSION
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
@@ -140,6 +141,20 @@ def test_a_mission_that_leaves_the_geofence_is_refused_by_the_operators_side_and
     for agent in (0, 1):
         (refused,) = events(flight, agent, "order_refused")
         assert "outside of geofence.corners_ne_m" in str(refused["reason"])
+
+
+def test_a_mission_that_ends_in_an_obstacle_of_now_is_refused_by_whose_goal_it_is(swap: Path) -> None:
+    flight = Lockstep(load(None, (*HOVER, "mission.duration_s=60")))
+    fly_until(flight, lambda: phase(flight, 0) is phase(flight, 1) is Phase.TRACK)
+    beside = Obstacle(center_ned_m=(4.5, 1.0, -3.0), radius_m=0.3, keep_out_m=0.6, visibility_m=2.0)
+    passing = Obstacle(center_ned_m=(0.0, -1.0, -3.0), radius_m=0.1, keep_out_m=0.2, vel_ned_m_s=(0.0, 0.0, 0.001))
+    flight.set_obstacles([passing, beside])
+    fly_for(flight, 0.1)
+    order(flight, swap)
+    fly_for(flight, 0.1)
+    (refused,) = events(flight, 0, "order_refused")
+    assert str(refused["reason"]).startswith("its goal is in the keep-out of obstacle 1, 0.50 m from its centre")
+    assert not events(flight, 1, "order_refused"), "what moves is gone until then"
 
 
 def test_a_file_that_this_swarm_can_not_fly_is_refused_before_it_is_sent(tmp_path: Path) -> None:

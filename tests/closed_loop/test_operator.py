@@ -47,6 +47,14 @@ def outcome(flight: Lockstep, agent: int = 0) -> str:
     return flown.outcome
 
 
+def alert(flight: Lockstep, agent: int = 0) -> str:
+    """Return the alert that an agent shows its operators."""
+    flown = flight.agents[agent]
+    assert flown is not None
+    raised = flown._publisher.active_alert
+    return "" if raised is None else raised.text
+
+
 @pytest.mark.parametrize("config", [None, "ardupilot_sitl.toml"], ids=["px4", "arducopter"])
 def test_a_hold_on_the_way_up_stops_the_climb_within_a_second_and_resume_flies_the_mission(config: str | None) -> None:
     flight = Lockstep(load(None if config is None else ROOT / "configs" / config, ON_GROUND_ALONE))
@@ -134,6 +142,29 @@ def test_a_goto_on_the_way_down_does_not_sink_on() -> None:
     target = np.array([60.0, 0.0, begun_m])
     fly_until(flight, lambda: bool(np.linalg.norm(vehicle(flight)[0] - target) < 0.3), 90.0)
     assert max(float(row["pos_ned_m"][2]) for row in flight.truth if row["t_us"] > begun_us) < begun_m + 3.0
+
+
+def test_a_point_in_an_obstacle_is_refused_and_one_that_an_obstacle_takes_later_is_told() -> None:
+    flight = in_the_air(5.0)
+    log = flight.logs[0].events
+    there = Obstacle(center_ned_m=(8.0, 0.0, -5.0), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0)
+    flight.set_obstacles([there])
+    fly_for(flight, 0.2)
+    flight.command("goto", 0, north_m=8.3, east_m=0.0, down_m=-5.0)
+    fly_for(flight, 0.2)
+    (refused,) = (event for event in log if event["event"] == "order_refused")
+    assert "8.3, 0, -5 is in the keep-out of obstacle 0, 0.30 m from its centre" in refused["reason"]
+    flight.command("goto", 0, north_m=5.0, east_m=0.0, down_m=-5.0)
+    fly_for(flight, 1.0)
+    assert not [event for event in log if event["event"] == "destination_taken"]
+    came = there.model_copy(update={"center_ned_m": (5.5, 0.0, -5.0)})
+    flight.set_obstacles([came])
+    fly_for(flight, 0.2)
+    assert "is to rest in the keep-out of obstacle 0, 0.50 m from its centre" in alert(flight)
+    assert least_m(flight, 6.0, lambda: came.distance_m(vehicle(flight)[0])) > came.keep_out_m - 0.05
+    flight.set_obstacles([])
+    fly_until(flight, lambda: bool(np.linalg.norm(vehicle(flight)[0] - [5.0, 0.0, -5.0]) < 0.3))
+    assert [event["begins"] for event in log if event["event"] == "destination_taken"] == [True, False]
 
 
 def least_m(flight: Lockstep, seconds: float, distance_m: Callable[[], float]) -> float:

@@ -353,6 +353,17 @@ def test_operator_verbs(
     file = tmp_path / "obstacles.toml"
     file.write_text("[[obstacles]]\ncenter_ned_m = [-40.0, 9.0, -9.0]\n")
     assert "1: sphere at -40.00, 9.00, -9.00" in verb("obstacle", "load", str(file)).stdout
+    inside = verb("goto", "0", "-40,9.5,-9")
+    assert inside.returncode == 4
+    assert "agent-0 refuses: -40, 9.5, -9 is in the keep-out of obstacle 1, 0.50 m from its centre" in inside.stdout
+    mission = tmp_path / "mission.toml"
+    mission.write_text(
+        "[mission]\nkind = 'goto'\nduration_s = 120\n"
+        "[mission.goto]\ngoals_ned_m = [[-40.0, 9.5, -9.0], [-40.0, 20.0, -9.0]]\n"
+    )
+    ends_inside = verb("mission", "set", str(mission))
+    assert ends_inside.returncode == 2, "before anything is sent"
+    assert "obstacles.1: the goal of agent 0 is 0.50 m from its centre" in ends_inside.stderr
     moved = verb("obstacle", "move", "0", "--velocity", "-1,0,0", "--json")
     assert moved.returncode == 0, moved.stderr
     assert json.loads(moved.stdout)[0]["vel_ned_m_s"] == [-1.0, 0.0, 0.0]

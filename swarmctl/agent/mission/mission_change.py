@@ -6,6 +6,8 @@ within a part of a tick.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from pydantic import ValidationError
 
 from swarmctl.agent.setup import AgentSetup
@@ -16,6 +18,7 @@ from swarmctl.bus.refusals import MALFORMED, Refusals
 from swarmctl.control.phases.trajectories import OfferedMission
 from swarmctl.control.reference.feasibility import FlightLimits, infeasible
 from swarmctl.control.reference.mission import MissionParams, MissionReference
+from swarmctl.core.obstacle import Obstacle, taken_by
 from swarmctl.core.operator_verbs import BEGIN, MISSION, Order
 
 _KEPT = 4  # newest missions
@@ -49,13 +52,16 @@ class MissionChange:
             for number in list(self._texts)[:-_KEPT]:
                 del self._texts[number]
 
-    def offer(self, order: Order, utc_us: int, ground_z_m: float | None) -> OfferedMission | str:
+    def offer(
+        self, order: Order, utc_us: int, ground_z_m: float | None, obstacles: Mapping[int, Obstacle]
+    ) -> OfferedMission | str:
         """Return the mission that is ordered, or why it is not flown.
 
         Args:
             order: of an operator.
             utc_us: now.
             ground_z_m: down coordinate of the ground, which the operator's side does not know of real vehicles.
+            obstacles: those at rest, by number: no mission may end in one.
         """
         text = self._texts.get(int(order.arguments[MISSION]))
         if text is None:
@@ -66,7 +72,10 @@ class MissionChange:
             mission = MissionParams.model_validate_json(text)
         except ValidationError as error:
             return f"its mission has a wrong value: {error.errors()[0]['msg']}"
-        return self._reference(mission, ground_z_m)
+        offered = self._reference(mission, ground_z_m)
+        goal = None if isinstance(offered, str) else offered.reference.goal
+        taken = "" if goal is None else taken_by(goal.pos_ned_m, obstacles)
+        return f"its goal is in {taken}" if taken else offered
 
     def _reference(self, mission: MissionParams, ground_z_m: float | None) -> OfferedMission | str:
         setup, agents = self._setup, len(self._setup.starts_ned_m)

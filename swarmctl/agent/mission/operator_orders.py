@@ -64,8 +64,8 @@ class OperatorOrders:
         if order.verb == EXCLUDE:
             return self._exclude(int(order.arguments[PEER]))
         refusal = self._offer_mission(order, now_us) if order.verb == MISSION else ""
-        state = self._ports.autopilot.poll(now_us)
-        return refusal or self._state_machine.operator(order, now_us, self._ports.utc_of_us(now_us), state)
+        state, obstacles = self._ports.autopilot.poll(now_us), self._world_model.obstacles.resting
+        return refusal or self._state_machine.operator(order, now_us, self._ports.utc_of_us(now_us), state, obstacles)
 
     def _exclude(self, peer: int) -> str:
         """Believe that a peer has ended; return why not, or ""."""
@@ -76,8 +76,8 @@ class OperatorOrders:
 
     def _offer_mission(self, order: Order, now_us: int) -> str:
         """Have the state machine know the mission of an order; return why it is not flown, or ""."""
-        ground_z_m = self._state_machine.mission.ground_z_m
-        offered = self._missions.offer(order, self._ports.utc_of_us(now_us), ground_z_m)
+        ground_z_m, obstacles = self._state_machine.mission.ground_z_m, self._world_model.obstacles.resting
+        offered = self._missions.offer(order, self._ports.utc_of_us(now_us), ground_z_m, obstacles)
         if isinstance(offered, str):
             return offered
         self._state_machine.mission.offered = offered

@@ -43,6 +43,11 @@ class KnownObstacles:
             return ""
         return SEQUENCE if message.is_too_far_from(known) else ""
 
+    @property
+    def resting(self) -> dict[int, Obstacle]:
+        """Return the obstacles of the newest list that do not move, seen or not, by number."""
+        return {item.number: item.obstacle for item in self.listed if not item.obstacle.moves}
+
     def visible(self, pos_ned_m: Array, utc_us: int) -> dict[int, Obstacle]:
         """Return the obstacles that are visible from a position (3,), as they are at a time, by number."""
         there = {item.number: item.at(utc_us) for item in self.listed}

@@ -51,6 +51,11 @@ class Interruptions:
         """Return whether the operator holds the agent at a point, or on the way there."""
         return self.held and self._point is not None
 
+    @property
+    def point_ned_m(self) -> Array | None:
+        """Return the point (3,) that a hold asks for; None where it holds where it is, or there is no hold."""
+        return self._point.ned_m if self.held and self._point is not None else None
+
     def hold(self, now_us: int, state: VehicleState, *, brakes: bool) -> None:
         """Hold where the vehicle is; it need not brake where the autopilot hovers."""
         self._interrupt(now_us, state, brakes=brakes)

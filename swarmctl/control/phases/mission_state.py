@@ -143,6 +143,16 @@ class MissionState:
         return self.phase is Phase.TRACK and not self.interruptions.active
 
     @property
+    def destination_ned_m(self) -> Array | None:
+        """Return where (3,) an operator, the mission or its beginning has the agent come to rest; None of a way."""
+        if self.held:
+            return self.interruptions.point_ned_m
+        if self.phase in (Phase.GOTO_START, Phase.READY):
+            return self.start_ned_m
+        goal = self.mission_reference.goal
+        return goal.pos_ned_m if self.phase is Phase.TRACK and goal is not None else None
+
+    @property
     def place_offset_ned_m(self) -> Array:
         """Return by how much the mission's reference (3,) is beside the one that several agents share."""
         return self.mission_reference.offset_ned_m if self.phase is Phase.TRACK else np.zeros(3)

@@ -6,12 +6,13 @@ An order that is not refused has its effect: `control.phases.obeyed_orders` appl
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from swarmctl.core.flight_volume import FlightVolume
+from swarmctl.core.obstacle import Obstacle, taken_by
 from swarmctl.core.operator_verbs import FAR, FAR_M, GOTO, OPERATOR_VERBS, POINT, Order
 from swarmctl.core.text import point_text
 from swarmctl.core.types import Array, Landed, Phase, VehicleState
@@ -36,6 +37,7 @@ class OrderSituation:
     way_ned_m: Array | None  # (K, 3) on which it would join a mission that is ordered; None where it does not at once
     contains: Contains
     volume: FlightVolume | None  # that plans keep to
+    obstacles: Mapping[int, Obstacle]  # at rest, by number
 
 
 def refusal_of(order: Order, situation: OrderSituation) -> str:
@@ -79,6 +81,8 @@ def _goto_refusal(order: Order, state: VehicleState, situation: OrderSituation) 
         return f"{point_text(target)} is {away_m:.0f} m away; beyond {FAR_M:g} m say --far"
     if situation.volume is not None and (refusal := situation.volume.refusal(target)):
         return refusal
+    if taken := taken_by(target, situation.obstacles):
+        return f"{point_text(target)} is in {taken}, where it would never arrive"
     points = min(_MOST_WAY_POINTS, 2 + int(math.dist(state.pos_ned_m[:2], target[:2]) / _WAY_STEP_M))
     return _way_refusal(np.linspace(target, state.pos_ned_m, points), situation)
 

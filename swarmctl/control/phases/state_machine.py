@@ -19,6 +19,7 @@ from swarmctl.control.phases.mission_state import PLAN_MODES, MissionSetup, Miss
 from swarmctl.control.phases.refused_orders import OrderSituation, refusal_of
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.phases.steps import ascent, descent, on_ground, tracking
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
 from swarmctl.core.types import Command, FlightMode, Mode, Phase, VehicleState
 
@@ -95,12 +96,20 @@ class MissionStateMachine:
         step = STEPS.get(mission.phase)
         return step(mission, inputs, state) if step else []
 
-    def operator(self, order: Order, now_us: int, utc_us: int, state: VehicleState | None) -> str:
+    def operator(
+        self, order: Order, now_us: int, utc_us: int, state: VehicleState | None, obstacles: Mapping[int, Obstacle]
+    ) -> str:
         """Apply an operator's order; return why it is refused, or "".
 
         A stop (land, rtl) is kept until a vehicle state is known to begin it from, so it is lost in no phase.
+
+        Args:
+            order: of an operator.
+            now_us, utc_us: monotonic time and UTC.
+            state: newest one, if there is any.
+            obstacles: those at rest, by number: nobody is sent into one.
         """
-        if refusal := refusal_of(order, self._situation(order, utc_us, state)):
+        if refusal := refusal_of(order, self._situation(order, utc_us, state, obstacles)):
             return refusal
         if OPERATOR_VERBS[order.verb].is_stop:
             self.mission.stop_verb = order.verb
@@ -111,7 +120,9 @@ class MissionStateMachine:
             obeyed_orders.ORDERS[order.verb](self.mission, order, now_us, utc_us, state)
         return ""
 
-    def _situation(self, order: Order, utc_us: int, state: VehicleState | None) -> OrderSituation:
+    def _situation(
+        self, order: Order, utc_us: int, state: VehicleState | None, obstacles: Mapping[int, Obstacle]
+    ) -> OrderSituation:
         mission = self.mission
         # the ground's height is known after a take-off
         lowest_m = float(mission.start_ned_m[2]) if mission.airborne else mission.climb.ground_z_m - _LEAST_HEIGHT_M
@@ -127,6 +138,7 @@ class MissionStateMachine:
             way_ned_m=obeyed_orders.way_into(mission, order, utc_us, state),
             contains=mission.contains,
             volume=mission.volume,
+            obstacles=obstacles,
         )
 
     def _respond(self, inputs: PhaseInputs, state: VehicleState) -> None:

@@ -13,6 +13,7 @@ from swarmctl.config import load_mission, load_recorded
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.operator_verbs import BEGIN, MISSION, Order
 from swarmctl.errors import ConfigError
+from swarmctl.ops.orders.obstacle_list import read_obstacles
 from swarmctl.ops.orders.operator import read_statuses
 from swarmctl.ops.orders.order_delivery import Reply, deliver
 from swarmctl.ops.running_launches import RunningLaunch
@@ -26,9 +27,10 @@ def set_mission(launch: RunningLaunch, file: Path, agents: Sequence[int]) -> lis
 
     Raises:
         ConfigError: there is no such agent, or the mission can't be flown by this launch.
-        StartError: the bus can't be joined.
+        StartError: the bus can't be joined, or the launch does not answer.
     """
-    mission = load_mission(load_recorded(Path(launch.run_dir)), file)
+    config, known = load_recorded(Path(launch.run_dir)), read_obstacles(launch).listed
+    mission = load_mission(config, file, {item.number: item.at(known.utc_us) for item in known.obstacles})
     message = mission_message(mission)
     payload = encode_message(message)
     if len(payload) > MAX_MISSION_BYTES:

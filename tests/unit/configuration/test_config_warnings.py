@@ -11,6 +11,7 @@ import pytest
 import swarmctl
 from swarmctl.config import dump, load, load_mission
 from swarmctl.configuration.config_warnings import config_warnings, unplayed, warning_lines
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]
@@ -157,3 +158,20 @@ def test_a_mission_whose_goals_are_in_an_obstacle_is_refused_in_flight_too(tmp_p
                 load_mission(flying, path)
         else:
             load_mission(flying, path)
+
+
+def test_in_flight_it_is_judged_by_the_obstacles_that_are_there_now(tmp_path: Path) -> None:
+    began_with = load(None, ["swarm.agents=1", "obstacles=[{center_ned_m=[4.0,0.0,-3.0],radius_m=0.5,keep_out_m=1.0}]"])
+    path = tmp_path / "goals.toml"
+    for north_m, obstacles, is_refused in ((4.0, {}, False), (8.0, None, False), (8.0, {3: (8.5, 0.0, -3.0)}, True)):
+        path.write_text(
+            "[mission]\nkind = 'goto'\nduration_s = 60\n"
+            f"[mission.goto]\ngoals_ned_m = [[{north_m}, 0.0, -3.0]]\ngoal_assignment = false\n"
+        )
+        there = {n: Obstacle(center_ned_m=centre) for n, centre in (obstacles or {}).items()}
+        if not is_refused:
+            load_mission(began_with, path, None if obstacles is None else there)
+            continue
+        with pytest.raises(ConfigError, match=r"obstacles\.3: the goal of agent 0 is 0\.50 m from its centre"):
+            load_mission(began_with, path, there)
+        load_mission(began_with, path, {3: there[3].model_copy(update={"vel_ned_m_s": (0.0, 1.0, 0.0)})})

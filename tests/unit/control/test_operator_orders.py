@@ -13,6 +13,7 @@ from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP, ORDERS, outcome
 from swarmctl.control.phases.trajectories import OfferedMission
 from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.flight_volume import FlightVolume, VolumeParams
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import BEGIN, EXCLUDE, FAR_M, GOTO, MISSION, OPERATOR_VERBS, Order, order_problem
 from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, START, Flight, controlled, in_phase
@@ -365,6 +366,20 @@ def test_a_point_outside_of_the_flight_volume_is_refused_with_its_reason() -> No
         assert face in refusal
     np.testing.assert_allclose(place(flight), held_at)
     assert flight.ask(GOTO, **POINT | {"north_m": 4.6}) == ""
+
+
+def test_a_point_in_the_keep_out_of_an_obstacle_is_refused_with_its_number() -> None:
+    flight = controlled(Phase.TRACK)
+    held_at = place(flight)
+    ball = Obstacle(center_ned_m=(3.0, -2.0, -5.0), keep_out_m=1.75)
+    flight.obstacles = (ball.model_copy(update={"center_ned_m": (50.0, 0.0, 0.0)}), ball)
+    said = "3, -2, -4 is in the keep-out of obstacle 1, 1.00 m from its centre (keep_out_m = 1.75)"
+    assert flight.ask(GOTO, **POINT).startswith(said)
+    np.testing.assert_allclose(place(flight), held_at)
+    assert flight.ask(GOTO, **POINT | {"down_m": -3.2}) == ""
+    flight.obstacles = (ball.model_copy(update={"column": True}),)
+    assert "2.00" not in (refusal := flight.ask(GOTO, **POINT | {"down_m": -3.2})), refusal
+    assert "0.00 m from its axis" in refusal
 
 
 def test_where_the_ground_is_unknown_nothing_lower_than_the_start_is_flown_to() -> None:
