@@ -78,6 +78,12 @@ class Obstacle(Params):
         north_m, east_m, down_m = pos_ned_m
         return self.distance_m((north_m, east_m, max(down_m, self.center_ned_m[2])))
 
+    def is_above(self, pos_ned_m: Array | Sequence[float], top_z_m: float) -> bool:
+        """Return whether the keep-out is on the vertical up from a position (3,) to a height, NED z; a column is."""
+        north_m, east_m, down_m = pos_ned_m
+        nearest = (north_m, east_m, max(self.center_ned_m[2], top_z_m))
+        return (self.column or self.center_ned_m[2] < down_m) and self.distance_m(nearest) < self.keep_out_m
+
     def moved(self, elapsed_s: float) -> Obstacle:
         """Return the obstacle as it is after a time: at another centre if it moves."""
         if not self.moves:

@@ -185,7 +185,7 @@ def test_a_climb_that_was_held_on_the_ground_waits_for_an_obstacle_that_has_come
 ) -> None:
     """Its autopilot, which climbs, avoids nothing."""
     if not waits:
-        monkeypatch.setattr(departure, "_obstacle_over", lambda *_: "")
+        monkeypatch.setattr(departure, "_to_go", lambda *_: "")
     flight = Lockstep(load(None, (*ON_GROUND_ALONE, "start.positions_ned_m=[[0,0,-5]]", "mission.kind=hover")))
     fly_until(flight, lambda: phase(flight) is Phase.TAKEOFF)
     flight.command("hold")
@@ -215,3 +215,29 @@ def test_a_climb_that_was_held_on_the_ground_waits_for_a_vehicle_that_has_come(
     flight.command("resume", 1)
     apart_m = least_m(flight, 5.0, lambda: float(np.linalg.norm(vehicle(flight, 0)[0] - vehicle(flight, 1)[0])))
     assert (apart_m >= 0.85) is waits
+
+
+@pytest.mark.parametrize("stops", [True, False], ids=["stops", "negative control"])
+@pytest.mark.parametrize("config", [None, "ardupilot_sitl.toml"], ids=["px4", "arducopter"])
+def test_a_climb_stops_below_an_obstacle_that_comes_and_goes_on_when_it_has_gone(
+    config: str | None, stops: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its autopilot alone climbs through the middle of it."""
+    if not stops:
+        monkeypatch.setattr(departure, "_to_go", lambda *_: "")
+    high = (*ON_GROUND_ALONE, "start.positions_ned_m=[[0,0,-8]]", "mission.kind=hover")
+    flight = Lockstep(load(None if config is None else ROOT / "configs" / config, high))
+    ground_z_m = float(vehicle(flight)[0][2])
+    fly_until(flight, lambda: phase(flight) is Phase.TAKEOFF and vehicle(flight)[0][2] < ground_z_m - 1.5)
+    came = BALL.model_copy(update={"center_ned_m": (0.3, 0.0, ground_z_m - 6.0)})
+    flight.set_obstacles([came])
+    nearest_m = least_m(flight, 10.0, lambda: came.distance_m(vehicle(flight)[0]))
+    assert (nearest_m > came.keep_out_m) is stops
+    if not stops:
+        assert nearest_m < came.radius_m
+        return
+    assert alert(flight) == "waits for an obstacle 0.30 m beside its climb to go (keep_out_m = 1.75)"
+    assert phase(flight) is Phase.TAKEOFF
+    flight.set_obstacles([])
+    fly_until(flight, lambda: phase(flight) > Phase.TRACK)
+    assert outcome(flight) == "completed"

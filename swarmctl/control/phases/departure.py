@@ -7,6 +7,7 @@ from collections.abc import Iterable, Set
 import numpy as np
 
 from swarmctl.control.phases.inputs import PhaseInputs
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, VehicleState
 
 _MOST_NAMED = 4  # agents in one line
@@ -42,16 +43,22 @@ def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[i
 
 
 def unmet_climb_condition(inputs: PhaseInputs, state: VehicleState, top_ned_m: Array) -> str:
-    """Return what has come since STANDBY into the way of a climb to (3,) that has not begun, or "".
+    """Return what has come since STANDBY into the way of a climb to (3,), or into that of its rest, or "".
 
     The autopilot that climbs avoids nobody, and an order or a lost link may have delayed it.
     """
-    return (inputs.unsettled or _obstacle_over(inputs, top_ned_m)) if state.landed is Landed.ON_GROUND else ""
+    if state.landed is Landed.ON_GROUND:
+        return inputs.unsettled or _obstacle_over(inputs, top_ned_m)
+    above = (o for o in inputs.obstacles(top_ned_m) if o.is_above(state.pos_ned_m, float(top_ned_m[2])))
+    return _to_go(next(above, None), top_ned_m)
 
 
 def _obstacle_over(inputs: PhaseInputs, top_ned_m: Array) -> str:
     """Return which obstacle has to go before the autopilot, which avoids none, can climb to (3,), or ""."""
-    obstacle = inputs.obstacle_below(top_ned_m, top_ned_m)
+    return _to_go(inputs.obstacle_below(top_ned_m, top_ned_m), top_ned_m)
+
+
+def _to_go(obstacle: Obstacle | None, top_ned_m: Array) -> str:
     if obstacle is None:
         return ""
     apart_m = obstacle.descent_distance_m(top_ned_m)
@@ -73,13 +80,14 @@ class Climb:
     Attributes:
         ground_z_m: down coordinate of the place that the vehicle stood on, 0 before it was armed.
         cut_short: a hold interrupted the climb below its height.
+        waits: the autopilot was asked to hold, because an obstacle has come into the way.
         was_ours: since it was armed, the vehicle has been in a mode that follows from our own requests.
     """
 
     def __init__(self, start_ned_m: Array) -> None:
         self._start_z_m = float(start_ned_m[2])
         self.ground_z_m = 0.0
-        self.cut_short = self.was_ours = False
+        self.cut_short = self.waits = self.was_ours = False
         self._hovering_us: int | None = None  # since when the autopilot hovers
         self._stopped_us: int | None = None  # since when it holds below its height
 
@@ -121,7 +129,7 @@ class Climb:
 
     def cut(self) -> None:
         """Note that the climb ends where the vehicle is now; the agent flies the rest of it."""
-        self.cut_short, self._stopped_us = True, None
+        self.cut_short, self.waits, self._stopped_us = True, False, None
 
     def rest_ned_m(self, state: VehicleState) -> Array:
         """Return the end (3,) of the rest of a climb that was cut short, straight above or below the vehicle."""

@@ -13,7 +13,7 @@ from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, Vehicl
 
 
 def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
-    """Request the climb, and wait until the vehicle hovers; a hold interrupts it."""
+    """Request the climb, and wait until the vehicle hovers; a hold interrupts it, and an obstacle in its way."""
     given_back = mission.may_take_control and mission.climb.cut_short  # in whatever mode it hovers
     climbed = mission.climb.update(inputs, state) or given_back
     if climbed and not mission.held:
@@ -28,16 +28,18 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
     if others and mission.climb.was_ours and not mission.may_take_control:  # who was armed in another mode takes off
         handover.leave_control(mission, inputs)
         return []
+    mission.waits_for = unmet_climb_condition(inputs, state, mission.climb.rest_ned_m(state))
     if mission.held:
         ours = state.mode is not FlightMode.HOLD and not others
         return [Command(verb=Verb.HOLD)] if ours and mission.may_request(inputs) else []
+    if state.landed is not Landed.ON_GROUND and (mission.waits_for or mission.climb.waits):
+        return _wait_below(mission, inputs, state)
     if mission.climb.is_stopped(inputs, state):
         if mission.climb.ends_near(state):
             mission.climb.cut()
         else:
             handover.leave_control(mission, inputs)
         return []
-    mission.waits_for = unmet_climb_condition(inputs, state, mission.climb.rest_ned_m(state))
     if (
         not mission.waits_for
         and state.mode is not FlightMode.TAKEOFF
@@ -48,6 +50,16 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
             mission.requested_us = inputs.now_us - SPIN_UP_US
             return [Command(verb=Verb.EXTERNAL)]
         return [Command(verb=Verb.TAKEOFF, value=mission.climb.height_m)]
+    return []
+
+
+def _wait_below(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    """Have the autopilot hold below an obstacle; when that has gone, the agent flies the rest of the climb."""
+    if mission.waits_for:
+        mission.climb.waits = True
+        return [Command(verb=Verb.HOLD)] if state.mode is not FlightMode.HOLD and mission.may_request(inputs) else []
+    if state.mode is FlightMode.HOLD:
+        mission.climb.cut()
     return []
 
 
