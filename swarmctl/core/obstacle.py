@@ -78,6 +78,10 @@ class Obstacle(Params):
         north_m, east_m, down_m = pos_ned_m
         return self.distance_m((north_m, east_m, max(down_m, self.center_ned_m[2])))
 
+    def is_below(self, pos_ned_m: Array | Sequence[float]) -> bool:
+        """Return whether the keep-out is on the vertical down from a position (3,)."""
+        return self.descent_distance_m(pos_ned_m) < self.keep_out_m
+
     def is_above(self, pos_ned_m: Array | Sequence[float], top_z_m: float) -> bool:
         """Return whether the keep-out is on the vertical up from a position (3,) to a height, NED z; a column is."""
         north_m, east_m, down_m = pos_ned_m

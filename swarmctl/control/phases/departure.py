@@ -80,6 +80,7 @@ class Climb:
     Attributes:
         ground_z_m: down coordinate of the place that the vehicle stood on, 0 before it was armed.
         cut_short: a hold interrupted the climb below its height.
+        abandoned: it was ended above an obstacle: the vehicle is to land beside that.
         waits: the autopilot was asked to hold, because an obstacle has come into the way.
         was_ours: since it was armed, the vehicle has been in a mode that follows from our own requests.
     """
@@ -87,7 +88,7 @@ class Climb:
     def __init__(self, start_ned_m: Array) -> None:
         self._start_z_m = float(start_ned_m[2])
         self.ground_z_m = 0.0
-        self.cut_short = self.waits = self.was_ours = False
+        self.cut_short = self.abandoned = self.waits = self.was_ours = False
         self._hovering_us: int | None = None  # since when the autopilot hovers
         self._stopped_us: int | None = None  # since when it holds below its height
 

@@ -51,4 +51,8 @@ class PhaseInputs:
     def obstacle_below(self, place_ned_m: Array, seen_from_ned_m: Array) -> Obstacle | None:
         """Return an obstacle, known at a position (3,), whose keep-out is on the vertical down from a place (3,)."""
         known = self.obstacles(seen_from_ned_m)
-        return next((o for o in known if o.descent_distance_m(place_ned_m) < o.keep_out_m), None)
+        return next((o for o in known if o.is_below(place_ned_m)), None)
+
+    def is_over_obstacle(self, state: VehicleState) -> bool:
+        """Return whether the autopilot, which avoids none, would land a vehicle on an obstacle."""
+        return self.obstacle_below(state.pos_ned_m, state.pos_ned_m) is not None

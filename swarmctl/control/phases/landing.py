@@ -126,7 +126,7 @@ class Landing:
         if not controls:
             return True
         apart = nearest_in_plane_m(state.pos_ned_m, inputs.others_ned_m()) >= self._apart_m
-        return apart and inputs.obstacle_below(state.pos_ned_m, state.pos_ned_m) is None
+        return apart and not inputs.is_over_obstacle(state)
 
 
 def _is_under_way(begun: BegunTrajectory, now_us: int) -> bool:

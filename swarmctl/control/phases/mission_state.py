@@ -208,6 +208,10 @@ class MissionState:
             completed=self.outcome == COMPLETED,
         )
 
+    def climbs(self, state: VehicleState) -> bool:
+        """Return whether the autopilot has the vehicle in the air, on its way up."""
+        return self.phase is Phase.TAKEOFF and state.armed and state.landed is not Landed.ON_GROUND
+
     def takes_back(self, now_us: int) -> bool:
         """Return whether the agent is taking the vehicle back, after an operator's resume, and does not have it yet."""
         return self.may_take_control and not self.had_control and now_us - self.resumed_us < _TAKES_BACK_US
@@ -252,7 +256,19 @@ class MissionState:
         if self.had_control and inputs.mode in PLAN_MODES:
             self.stop_in_place(inputs.now_us, state)
             return
+        if self.climbs(state) and inputs.is_over_obstacle(state):
+            self.abandon_climb(inputs.now_us)
+            return
         self.enter(Phase.DONE if self.is_down(inputs, state) else Phase.LAND, inputs.now_us)
+
+    def abandon_climb(self, now_us: int) -> None:
+        """End a climb above an obstacle: the autopilot, which would land straight down, holds until we have control."""
+        self.interruptions.end_hold()
+        if not self.climb.abandoned:
+            self.climb.abandoned = True
+            self.climb.cut()
+            self.requested_us = now_us - SPIN_UP_US
+            self.land_by_us = now_us + round(self.params.land_timeout_s * 1e6)
 
     def go_home(self, now_us: int, state: VehicleState) -> None:
         """Fly to the landing place."""

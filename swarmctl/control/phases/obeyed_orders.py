@@ -18,13 +18,22 @@ _WHOLE_M = 100.0  # a longer way is told in whole metres
 OPERATOR_STOP = "stopped by the operator"
 
 
-def apply_stop(mission: MissionState, now_us: int, state: VehicleState) -> None:
-    """Begin the stop that has been commanded, unless it is under way."""
+def apply_stop(mission: MissionState, now_us: int, state: VehicleState, is_over: Callable[[], bool]) -> None:
+    """Begin the stop that has been commanded, unless it is under way.
+
+    Args:
+        mission: that is stopped.
+        now_us: monotonic time.
+        state: newest one.
+        is_over: returns whether an obstacle at rest is on the way straight down.
+    """
     verb, mission.stop_verb = mission.stop_verb, ""
     if not verb or mission.phase >= Phase.LAND:
         return
     mission.outcome = mission.outcome or OPERATOR_STOP
-    if mission.phase < Phase.GOTO_START or mission.pilot_override:
+    if mission.climbs(state) and not mission.pilot_override and is_over():
+        mission.abandon_climb(now_us)
+    elif mission.phase < Phase.GOTO_START or mission.pilot_override:
         mission.enter(Phase.LAND, now_us)  # ends at once if the vehicle is known to be disarmed
     elif verb == "rtl" and mission.may_fly_on:
         mission.go_home(now_us, state)

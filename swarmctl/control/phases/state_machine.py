@@ -79,7 +79,7 @@ class MissionStateMachine:
                 mission.override(REBOOTED, inputs.now_us)
         if state is None:
             return []
-        obeyed_orders.apply_stop(mission, inputs.now_us, state)
+        obeyed_orders.apply_stop(mission, inputs.now_us, state, lambda: inputs.is_over_obstacle(state))
         if mission.phase is Phase.CONNECT and inputs.prepared:  # peers arm as soon as all agents stand by
             mission.enter(Phase.STANDBY, inputs.now_us)
             return mission.refuse(inputs.refusal, inputs) if inputs.refusal else []
@@ -115,7 +115,8 @@ class MissionStateMachine:
             self.mission.stop_verb = order.verb
         if state is None:
             return ""
-        obeyed_orders.apply_stop(self.mission, now_us, state)
+        below = (obstacle for obstacle in obstacles.values() if obstacle.is_below(state.pos_ned_m))
+        obeyed_orders.apply_stop(self.mission, now_us, state, lambda: any(below))
         if order.verb in obeyed_orders.ORDERS:
             obeyed_orders.ORDERS[order.verb](self.mission, order, now_us, utc_us, state)
         return ""

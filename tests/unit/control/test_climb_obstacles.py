@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import FlightMode, Phase, Verb
+from swarmctl.core.types import FlightMode, Mode, Phase, Verb
 from tests.benches.state_machine_flight import START, Flight, in_phase
 
 NORTH, EAST, DOWN = START
 BALL = Obstacle(center_ned_m=(NORTH + 0.5, EAST, DOWN), radius_m=1.0, keep_out_m=1.2)
+BELOW = BALL.model_copy(update={"center_ned_m": (NORTH + 0.5, EAST, DOWN + 3.0)})
 LONG_S = 60.0  # within `start_timeout_s`
 
 
@@ -27,7 +28,7 @@ def holds(flight: Flight) -> bool:
     if asked != [Verb.HOLD]:
         return False
     flight.flight_mode = FlightMode.HOLD
-    return flight.run(LONG_S) == [] and flight.phase is Phase.TAKEOFF and not flight.mission.pilot_override
+    return flight.run(LONG_S) == [] and flight.at == "TAKEOFF" and not flight.mission.pilot_override
 
 
 def test_it_is_stopped_for_as_long_as_an_obstacle_is_above() -> None:
@@ -36,7 +37,7 @@ def test_it_is_stopped_for_as_long_as_an_obstacle_is_above() -> None:
     assert flight.mission.waits_for == "an obstacle 0.50 m beside its climb to go (keep_out_m = 1.2)"
     flight.obstacles = ()
     flight.run(0.3)
-    assert flight.phase is Phase.GOTO_START
+    assert flight.at == "GOTO_START"
     assert flight.mission.climb.cut_short, "the agent flies the rest of it"
 
 
@@ -68,7 +69,7 @@ def test_an_obstacle_that_goes_before_the_autopilot_holds_leaves_it_to_the_agent
     assert flight.run(0.3) == []
     flight.flight_mode = FlightMode.HOLD  # as asked before
     flight.run(0.3)
-    assert flight.phase is Phase.GOTO_START
+    assert flight.at == "GOTO_START"
 
 
 def test_an_operator_sends_it_on_by_hold_and_resume_under_the_agents_own_planner() -> None:
@@ -78,7 +79,7 @@ def test_an_operator_sends_it_on_by_hold_and_resume_under_the_agents_own_planner
     flight.run(1.0)
     assert flight.ask("resume") == ""
     flight.run(0.3)
-    assert flight.phase is Phase.GOTO_START
+    assert flight.at == "GOTO_START"
 
 
 def test_who_waits_too_long_is_landed_and_says_why() -> None:
@@ -86,3 +87,86 @@ def test_who_waits_too_long_is_landed_and_says_why() -> None:
     assert holds(flight)
     assert Verb.LAND in flight.run(40.0)
     assert flight.mission.outcome.startswith("not tracking after 90 s (TAKEOFF): an obstacle 0.50 m beside its climb")
+
+
+@pytest.mark.parametrize("verb", ["land", "rtl"])
+def test_who_is_landed_above_an_obstacle_holds_takes_control_and_lands_beside_it(verb: str) -> None:
+    flight = climbing(BELOW)
+    assert flight.ask(verb) == ""
+    assert flight.run(0.5) == [Verb.HOLD]
+    assert flight.at == "TAKEOFF"
+    flight.flight_mode = FlightMode.HOLD
+    assert flight.run(0.5) == [Verb.EXTERNAL]
+    flight.flight_mode, flight.failsafe_mode = FlightMode.EXTERNAL, Mode.TRACKING
+    assert Verb.LAND not in flight.run(6.0)
+    assert flight.at == "GOTO_LAND"
+    place = flight.mission.reference(flight.utc_us, flight.now_us, np.array([60.0]))[0][0]
+    assert np.linalg.norm((place - np.array(BELOW.center_ned_m))[:2]) == pytest.approx(BELOW.keep_out_m + 0.1)
+    flight.pos = place
+    assert Verb.LAND in flight.run(6.0)
+
+
+@pytest.mark.parametrize("verb", ["land", "rtl"])
+def test_negative_control_nothing_below_delays_a_landing(verb: str) -> None:
+    flight = climbing(BALL)
+    flight.ask(verb)
+    assert flight.run(0.5) == [Verb.LAND]
+    assert flight.at == "LAND"
+
+
+def test_a_stop_above_an_obstacle_is_sticky() -> None:
+    flight = climbing(BELOW)
+    flight.ask("land")
+    flight.flight_mode = FlightMode.HOLD
+    flight.ask("hold")
+    assert flight.run(1.0) == []
+    assert flight.at == "TAKEOFF"
+    flight.ask("resume")
+    flight.run(0.3)
+    assert flight.at == "GOTO_LAND"
+
+
+def test_once_the_obstacle_has_gone_the_autopilot_lands_it() -> None:
+    flight = climbing(BELOW)
+    flight.ask("land")
+    flight.run(0.2)
+    flight.obstacles = ()
+    assert flight.run(0.5) == [Verb.LAND]
+
+
+def test_a_start_that_is_given_up_above_an_obstacle_is_no_reason_to_land_on_it() -> None:
+    flight = climbing(BELOW)
+    asked = flight.run(91.0)
+    assert asked.count(Verb.LAND) == 0
+    assert asked.count(Verb.HOLD) > 0
+    assert flight.mission.outcome.startswith("not tracking after 90 s")
+
+
+@pytest.mark.parametrize("mode", [FlightMode.TAKEOFF, FlightMode.HOLD], ids=["does not hold", "gives no control"])
+def test_an_autopilot_that_does_not_obey_lands_it_all_the_same(mode: FlightMode) -> None:
+    flight = climbing(BELOW)
+    flight.ask("land")
+    flight.flight_mode = mode
+    assert Verb.LAND not in flight.run(19.0)
+    assert Verb.LAND in flight.run(5.0)
+
+
+def test_a_pilot_who_takes_it_meanwhile_has_it_and_gives_it_back_to_be_landed_beside() -> None:
+    flight = climbing(BELOW)
+    flight.ask("land")
+    flight.run(0.2)
+    flight.flight_mode = FlightMode.MANUAL
+    assert flight.run(1.0) == []
+    assert flight.mission.pilot_override
+    assert flight.ask("resume") == ""
+    assert flight.run(0.5) == [Verb.EXTERNAL]
+    assert flight.at == "GOTO_LAND"
+
+
+def test_who_has_climbed_and_has_no_control_yet_lands_beside_it_too() -> None:
+    flight = Flight().until(Phase.GOTO_START)
+    flight.obstacles = (BELOW,)
+    flight.ask("land")
+    assert set(flight.run(4.0)) == {Verb.EXTERNAL}
+    flight.obstacles = ()
+    assert Verb.LAND in flight.run(4.0)

@@ -17,7 +17,10 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
     given_back = mission.may_take_control and mission.climb.cut_short  # in whatever mode it hovers
     climbed = mission.climb.update(inputs, state) or given_back
     if climbed and not mission.held:
-        mission.enter(Phase.GOTO_START, inputs.now_us)
+        if mission.climb.abandoned:
+            mission.stop_in_place(inputs.now_us, state)
+        else:
+            mission.enter(Phase.GOTO_START, inputs.now_us)
         return []
     if not state.armed:  # pilot or autopilot disarmed it: it is not armed again
         if mission.arming.is_disarmed(inputs, state):
@@ -30,8 +33,9 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
         return []
     mission.waits_for = unmet_climb_condition(inputs, state, mission.climb.rest_ned_m(state))
     if mission.held:
-        ours = state.mode is not FlightMode.HOLD and not others
-        return [Command(verb=Verb.HOLD)] if ours and mission.may_request(inputs) else []
+        return [] if others else _hold(mission, inputs, state)
+    if mission.climb.abandoned:
+        return _stop_above(mission, inputs, state)
     if state.landed is not Landed.ON_GROUND and (mission.waits_for or mission.climb.waits):
         return _wait_below(mission, inputs, state)
     if mission.climb.is_stopped(inputs, state):
@@ -40,27 +44,39 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
         else:
             handover.leave_control(mission, inputs)
         return []
-    if (
-        not mission.waits_for
-        and state.mode is not FlightMode.TAKEOFF
-        and state.landed is Landed.ON_GROUND
-        and mission.may_request(inputs, SPIN_UP_US)
-    ):
-        if state.mode is FlightMode.HOLD and inputs.arm_in is not None:  # where a hold has left it
-            mission.requested_us = inputs.now_us - SPIN_UP_US
-            return [Command(verb=Verb.EXTERNAL)]
-        return [Command(verb=Verb.TAKEOFF, value=mission.climb.height_m)]
-    return []
+    stands = state.landed is Landed.ON_GROUND and state.mode is not FlightMode.TAKEOFF
+    return _climb(mission, inputs, state) if stands and not mission.waits_for else []
+
+
+def _climb(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    if not mission.may_request(inputs, SPIN_UP_US):
+        return []
+    if state.mode is FlightMode.HOLD and inputs.arm_in is not None:  # where a hold has left it
+        mission.requested_us = inputs.now_us - SPIN_UP_US
+        return [Command(verb=Verb.EXTERNAL)]
+    return [Command(verb=Verb.TAKEOFF, value=mission.climb.height_m)]
+
+
+def _hold(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    return [Command(verb=Verb.HOLD)] if state.mode is not FlightMode.HOLD and mission.may_request(inputs) else []
 
 
 def _wait_below(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
     """Have the autopilot hold below an obstacle; when that has gone, the agent flies the rest of the climb."""
     if mission.waits_for:
         mission.climb.waits = True
-        return [Command(verb=Verb.HOLD)] if state.mode is not FlightMode.HOLD and mission.may_request(inputs) else []
+        return _hold(mission, inputs, state)
     if state.mode is FlightMode.HOLD:
         mission.climb.cut()
     return []
+
+
+def _stop_above(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    """Have the autopilot hold above an obstacle, or land where it is once nothing is below it, or after too long."""
+    if inputs.now_us > mission.land_by_us or not inputs.is_over_obstacle(state):
+        mission.enter(Phase.LAND, inputs.now_us)
+        return []
+    return _hold(mission, inputs, state)
 
 
 def goto_start(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:

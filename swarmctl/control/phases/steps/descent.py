@@ -14,13 +14,19 @@ _STANDS_US = 5_000_000  # that an autopilot has to disarm by itself
 
 
 def goto_land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
-    """Fly to the landing place; after too long, land where the vehicle is."""
+    """Fly to the landing place; after too long, land where the vehicle is.
+
+    A vehicle that its autopilot still flies, as it was stopped before the agent had control, is landed by it where it
+    is, unless that would be on an obstacle.
+    """
     if mission.held:
         return []
     given_back = mission.may_take_control and not mission.had_control
     if given_back and (mission.takes_back(inputs.now_us) or not mission.landing.in_place):
         return handover.request_control(mission, inputs, state)
     landing, controls = mission.landing, mission.had_control
+    if not (controls or given_back) and inputs.now_us <= mission.land_by_us and inputs.is_over_obstacle(state):
+        return handover.request_control(mission, inputs, state)
     if landing.is_reached(inputs, state, controls=controls, paused=mission.interruptions.paused):
         mission.enter(Phase.LAND, inputs.now_us)
     elif inputs.now_us > mission.land_by_us:
