@@ -81,4 +81,4 @@ class LimitParams(Params):
 
     min_separation_m: float = Field(0.85, ge=0, le=100)  # distance of two centres, of true states where there are any
     obstacle_margin_m: float = Field(0.05, ge=0, le=10)  # allowed intrusion into keep_out_m, never into radius_m
-    deadline_misses_01: float = Field(0.2, ge=0, le=1)  # largest fraction of deadlines missed
+    deadline_misses_01: float = Field(0.2, ge=0, le=1)  # largest fraction of deadlines missed, also by one agent

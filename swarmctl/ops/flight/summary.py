@@ -127,8 +127,8 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         + (f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else "")
         + _corrected(summary),
         *_seen_late(summary),
-        f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')} from arming on, "
-        f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
+        f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')} from arming on"
+        f"{_worst(summary)}, tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
         f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} bus messages refused"
         + _refused_frames(comms)
@@ -159,6 +159,14 @@ def _separation(summary: Mapping[str, Any]) -> str:
 def _corrected(summary: Mapping[str, Any]) -> str:
     corrected = corrected_text(summary.get("clocks"))
     return f"; clocks corrected: {corrected}" if corrected else ""
+
+
+def _worst(summary: Mapping[str, Any]) -> str:
+    """Return which of several agents has missed most of its deadlines; "" where none were missed."""
+    worst = _section(_section(summary, "timing"), "worst_agent")
+    if not worst or summary.get("agents") == 1:
+        return ""
+    return f" (agent-{worst['id']}: {worst['late_ticks']} of {worst['due_ticks']} due)"
 
 
 def _seen_late(summary: Mapping[str, Any]) -> tuple[str, ...]:

@@ -22,13 +22,13 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
 from swarmctl.telemetry.evaluation.arrivals import reached_goals
 from swarmctl.telemetry.evaluation.crashes import crashes
+from swarmctl.telemetry.evaluation.punctuality import evaluate_timing
 from swarmctl.telemetry.evaluation.reception import refused_peers
 from swarmctl.telemetry.evaluation.run_counts import (
     commitment_counts,
     communication,
     deadlock_counts,
     own_controllers,
-    percentiles,
     solver_counts,
 )
 from swarmctl.telemetry.evaluation.station_clock import ClockedTicks, by_station_clock, seen_late
@@ -67,7 +67,7 @@ class Rules:
     required_separation_m: float
     obstacles: tuple[JudgedObstacle, ...] = ()
     obstacle_margin_m: float = 0.05  # allowed intrusion into keep_out_m, never into radius_m
-    deadline_misses_01: float = 0.2  # largest fraction of due ticks, flown or skipped, that may miss their deadline
+    deadline_misses_01: float = 0.2  # largest fraction of due ticks, flown or skipped, that may be late, also of one
     solver_name: str = "osqp"
     solver_retry: str = "osqp"  # solves what that one does not finish
     mode: Literal["realtime", "lockstep"] = "realtime"
@@ -114,7 +114,7 @@ def evaluate(
     separation, apart = _evaluate_separation(tracks, rules, here if flew else (), clock)
     obstacles, clear = _evaluate_obstacles(tracks, rules, clock)
     volume, inside = _evaluate_volume(run, tracks, rules, clock)
-    timing, punctual = _evaluate_timing(run.ticks, rules, speed_factor)
+    timing, punctual = evaluate_timing(run.ticks, rules.deadline_misses_01, speed_factor)
     tracking, tracked_s = _evaluate_tracking(run, rules.agents)
     unseen = [] if len(run.truth) else [*clocked.problems(), *_unseen(clocked, rules.agents, clock)]
     refused = _shorten(list(refused_peers(run.events)))
@@ -300,29 +300,6 @@ def _evaluate_volume(
             left = f"{beyond_m[worst]:.3f} m outside of the flight volume ({face})"
             violations.append(f"agent {agent} {left} at {at_s:.1f} s")
     return {"least_inside_m": finite(least_m), "margin_m": rules.volume.params.margin_m}, _shorten(violations)
-
-
-def _evaluate_timing(
-    ticks: Mapping[int, NDArray[np.void]], rules: Rules, speed_factor: float | None
-) -> tuple[dict[str, Any], list[str]]:
-    """Summarise tick times, solve times and deadline misses between arming and the end of landing."""
-    flights = [flight_rows(rows) for rows in ticks.values()]
-    total = sum(len(rows) for rows in flights)
-    steps = [np.maximum(np.diff(rows["deadline_misses"].astype(np.int64)), 0) for rows in flights]
-    late = sum(int(step.sum()) for step in steps)
-    # of the deadlines missed between two ticks at most one belongs to a flown tick; the others were due but skipped
-    due = total + sum(int(np.maximum(step - 1, 0).sum()) for step in steps)
-    timing = {
-        "ticks": total,
-        "due_ticks": due,
-        "late_ticks": late,
-        "tick_ms": percentiles([rows["tick_ms"] for rows in flights]),
-        "solve_ms": percentiles([rows["solve_ms"][rows["iterations"] > 0] for rows in flights]),
-        "speed_factor": speed_factor,
-    }
-    if due and late > rules.deadline_misses_01 * due:
-        return timing, [f"deadline misses {late / due:.1%} above {rules.deadline_misses_01:.1%} ({late} of {due} due)"]
-    return timing, []
 
 
 def _evaluate_tracking(run: RunData, agents: int) -> tuple[dict[str, Any], dict[int, float]]:

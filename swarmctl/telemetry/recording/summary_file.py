@@ -41,13 +41,20 @@ class _Obstacles(msgspec.Struct):
     required_m: _Figure | None = None
 
 
+class _WorstAgent(msgspec.Struct):
+    id: Annotated[int, msgspec.Meta(ge=0, lt=1000)]
+    due_ticks: _Count
+    late_ticks: _Count
+
+
 class _Timing(msgspec.Struct):
     ticks: _Count
     late_ticks: _Count
     tick_ms: _Percentiles
     solve_ms: _Percentiles
     speed_factor: _Figure | None = None
-    due_ticks: _Count = 0  # missing in older folders
+    due_ticks: _Count = 0  # missing in older folders, as is the next
+    worst_agent: _WorstAgent | None = None
 
 
 class _Solver(msgspec.Struct):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from swarmctl.files import replace_bytes, replace_text
+from swarmctl.telemetry.evaluation.punctuality import LEAST_DUE
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR, Rules, RunData
 from swarmctl.telemetry.evaluation.station_clock import corrected_text
 from swarmctl.telemetry.palette import agent_rgb, css
@@ -123,6 +124,10 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     late = f"{timing['late_ticks']} of {due}"
     limit = "" if most is None else f"{100 * most:.3g}%"
     yield SummaryRow(f"deadline misses {IN_FLIGHT}", late, limit, good, timing["late_ticks"])
+    if (worst := timing.get("worst_agent")) and summary["agents"] > 1:
+        late, due = f"{worst['late_ticks']} of {worst['due_ticks']}, agent {worst['id']}", worst["due_ticks"]
+        good = None if most is None or due < LEAST_DUE else worst["late_ticks"] <= most * due
+        yield SummaryRow("the most of one agent", late, limit, good, worst["late_ticks"])
     named = (
         ("summed mean tracking error", "index_m", SUMMED_ERROR),
         ("the same after 10 s", "index_after_10s_m", "without the first 10 s in TRACK"),
