@@ -225,15 +225,15 @@ def test_a_new_run_refuses_a_folder_with_links(tmp_path: Path) -> None:
         create_run_folder(tmp_path, "circle", 0)
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_noise_as_rows_is_reported_or_refused(folder: Path, seed: int) -> None:
-    """Values that no agent records: every phase, NaN and infinity anywhere, times within the same two days."""
+@pytest.mark.parametrize(("seed", "within_us"), [(0, 10**10), *((seed, 10**9) for seed in range(1, 8))])
+def test_noise_as_rows_is_reported_or_refused(folder: Path, seed: int, within_us: int) -> None:
+    """Values that no agent records: every phase, NaN and infinity anywhere, times within the same hours or minutes."""
     random = np.random.default_rng(seed)
     for name, dtype in (("agent-0.ticks", TICK_DTYPE), ("agent-9.ticks", TICK_DTYPE), ("truth.bin", TRUTH_DTYPE)):
         rows = np.frombuffer(random.bytes(300 * dtype.itemsize), dtype).copy()
-        rows["t_us"] = random.integers(0, 10**10, 300)
+        rows["t_us"] = random.integers(0, within_us, 300)
         if "utc_us" in (dtype.names or ()):
-            rows["utc_us"] = random.integers(0, 10**10, 300)
+            rows["utc_us"] = random.integers(0, within_us, 300)
         rows.tofile(folder / name)
     (folder / "summary.json").unlink()
     with np.errstate(all="ignore"):
