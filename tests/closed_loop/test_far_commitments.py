@@ -32,9 +32,12 @@ def by_commitments_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Interest, "_reaches", lambda *_, **__: False)
 
 
-def head_on(*more: str) -> Flight:
-    """Fly two agents towards each other, each to the start of the other one, from where neither reaches the other."""
-    return to_goals(_STARTS, _STARTS[::-1], *FAR, *more)
+def head_on(*more: str, too_close_m: float = 0.0) -> Flight:
+    """Fly two agents towards each other, each to the start of the other one, from where neither reaches the other.
+
+    The flight ends when they are too close.
+    """
+    return to_goals(_STARTS, _STARTS[::-1], *FAR, *more, too_close_m=too_close_m)
 
 
 def sent(flight: Flight) -> dict[str, int]:
@@ -52,7 +55,7 @@ def test_two_that_come_from_far_acknowledge_each_other_before_they_can_meet() ->
 @pytest.mark.usefixtures("by_commitments_alone")
 def test_negative_control_who_is_taken_for_far_for_ever_is_flown_into(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FarPeers, "_radius_m", lambda *_: -1.0)
-    assert head_on().separation_m() < 0.5
+    assert head_on(too_close_m=0.5).separation_m() < 0.5
 
 
 def share_for_all_01() -> float:

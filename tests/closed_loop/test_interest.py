@@ -15,19 +15,20 @@ from swarmctl.bus import topics
 from swarmctl.bus.local.hub import LocalBus
 from swarmctl.bus.peers import PeerPaths
 from swarmctl.bus.topics import Topic
-from tests.closed_loop.conftest import Flight, fly_now
+from tests.closed_loop.conftest import Flight, closer_than, fly_now
 
 FAR = "agent.path_sharing.far_hz=1"
 MET_M = 3.0
 TICK_S = 0.02
 
 
-def to_goals(starts: list[list[float]], goals: list[list[float]], *more: str) -> Flight:
-    """Fly every agent to its goal."""
+def to_goals(starts: list[list[float]], goals: list[list[float]], *more: str, too_close_m: float = 0.0) -> Flight:
+    """Fly every agent to its goal, or until two are too close."""
+    too_close = closer_than(too_close_m)
 
     def arrived(lockstep: Lockstep) -> bool:
         off_m = np.linalg.norm(lockstep.world.truth_rows()["pos_ned_m"] - np.array(goals), axis=1)
-        return bool(off_m.max() < 0.1)
+        return bool(off_m.max() < 0.1) or too_close(lockstep)
 
     return fly_now(
         *("sitl.start=air", f"swarm.agents={len(starts)}", f"start.positions_ned_m={json.dumps(starts)}"),
@@ -74,10 +75,10 @@ def oldest_path_s(flight: Flight) -> float:
     return max(ages_s)
 
 
-def head_on(*more: str) -> Flight:
+def head_on(*more: str, too_close_m: float = 0.0) -> Flight:
     """Fly two agents towards each other from out of reach, at 2 m/s."""
     starts = [[0.0, -12.0, -3.0], [0.0, 12.0, -3.0]]
-    return to_goals(starts, starts[::-1], FAR, *more)
+    return to_goals(starts, starts[::-1], FAR, *more, too_close_m=too_close_m)
 
 
 @pytest.fixture(scope="module")
@@ -125,4 +126,4 @@ def test_negative_control_by_the_age_of_what_is_known_it_is(monkeypatch: pytest.
 
 def test_negative_control_who_never_gets_within_reach_is_flown_into(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Interest, "_reaches", lambda *_, **__: False)
-    assert head_on().separation_m() < 0.5
+    assert head_on(too_close_m=0.5).separation_m() < 0.5

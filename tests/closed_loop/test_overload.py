@@ -39,6 +39,11 @@ def over(lockstep: Lockstep) -> bool:
     return lockstep.finished or lockstep.clock.now_us() > 30e6
 
 
+def waited_or_climbed(lockstep: Lockstep) -> bool:
+    """Those that don't wait are a metre up after 9.5 s."""
+    return lockstep.clock.now_us() > 15e6 or climbed_m(lockstep) > 1.0
+
+
 @pytest.mark.parametrize("seed", [0, 3])
 def test_agents_missing_nine_of_ten_deadlines_come_to_rest_far_apart_and_land(seed: int) -> None:
     """Ten starts, nine of them shifted by a millimetre, keep 4.3 m."""
@@ -75,7 +80,7 @@ def test_agents_whose_plans_take_ten_ticks_stay_on_the_ground(
     def until(lockstep: Lockstep) -> bool:
         clock.append(lockstep.clock.now_us())
         lockstep.starved = {i: 10 for i, at_us in newest_us.items() if clock[-1] - at_us < 200_000}
-        return over(lockstep) or climbed_m(lockstep) > 1.0
+        return waited_or_climbed(lockstep)
 
     clock.append(0)
     monkeypatch.setattr(SwarmMpc, "plan", slow)
@@ -93,7 +98,7 @@ def test_agents_that_miss_a_third_of_their_deadlines_on_the_ground_wait(more: tu
 
     def until(lockstep: Lockstep) -> bool:
         lockstep.starved = dict.fromkeys(range(4), 2 if lockstep.clock.now_us() // 100_000 % 3 else 1)
-        return over(lockstep) or climbed_m(lockstep) > 1.0
+        return waited_or_climbed(lockstep)
 
     lockstep = fly_now(*SWAP[:2], *more, config="swap8.toml", until=until).lockstep
     assert (climbed_m(lockstep) > 1.0) == climbs
@@ -152,7 +157,8 @@ def stalling(*more: str, seed: int, too_close_m: float = 0.0) -> float:
     """Fly three on a circle whose computer stands still for 0.24 s every 2.7 s; return the least separation.
 
     8 % of deadlines are missed. The first stall that counts is that at 5.4 s; nobody can foresee that of 2.7 s.
-    The flight ends when two are too close after 6 s.
+    The flight ends when two are too close after 6 s, or after four stalls in formation: each of the first three brings
+    who has forgotten the ones before to 0.85 to 0.89 m.
     """
 
     too_close = closer_than(too_close_m)
@@ -160,7 +166,7 @@ def stalling(*more: str, seed: int, too_close_m: float = 0.0) -> float:
     def until(lockstep: Lockstep) -> bool:
         now_s = lockstep.clock.now_us() * 1e-6
         lockstep.starved.update(dict.fromkeys(range(3), 10**9 if now_s > 3.0 and now_s % 2.7 < 0.24 else 1))
-        return now_s > 32.0 or (now_s > 6.1 and too_close(lockstep))
+        return now_s > 20.0 or (now_s > 6.1 and too_close(lockstep))
 
     flight = fly_now("sitl.physics_hz=100", "sitl.start=air", *more, until=until, seed=seed)
     return float(closest_pair_m(flight.pos_ned_m[flight.t_s > 6.0]).min())
