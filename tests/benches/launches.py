@@ -20,12 +20,12 @@ from pymavlink.dialects.v20 import development as mavlink
 from swarmctl.core.types import Phase
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
-from tests.process.test_readme import ROOT, landed
+from tests.process.test_readme import COARSE, ROOT, landed
 
 READY_S = 90.0
 END_S = 150.0
 TWO = ("--agents", "2", "--set", "telemetry.enabled=false")
-COARSE = ("--set", "sitl.physics_hz=100", "--set", "agent.rate_hz=25")  # how a launch ends depends on neither
+# How a launch ends does not depend on the rates of COARSE.
 STAY = (*COARSE, "--set", "mission.kind=swap", "--set", "mission.swap.travel_s=600", "--set", "start.spacing_m=2")
 NEAR = (*STAY, "--set", "sitl.ground_z_m=0.5")  # nothing to reach, nothing in the way, and a short landing
 PATIENT = "agent.autopilot_params={COM_OBL_RC_ACT=4,COM_OF_LOSS_T=3}"  # where there is no ground no failsafe ever lands

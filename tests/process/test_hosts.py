@@ -167,7 +167,7 @@ def test_two_hosts_fly_one_swarm_that_a_station_commands_and_judges(
 
 
 def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_swarm(tmp_path, duration_s=20.0)
+    path = write_swarm(tmp_path)
     make_keys(path, monkeypatch)
     with started(path) as start:
         alpha, bravo, station = start("alpha"), start("bravo"), start("station")

@@ -1,8 +1,8 @@
 """Every command of README.md and docs/ is run as it stands, only shortened and kept off the screen.
 
 What is launched is shortened by `--duration`, and by a ground no more than a metre below the start; what is simulated
-by `--duration` and a start in the air. The launch that is shown with a configuration is the whole mission of
-test_launch.py.
+by `--duration` and a start in the air. Both are flown at half the rate, `COARSE`, on which no command depends. The
+launch that is shown with a configuration is the whole mission of test_launch.py, at the rates that are configured.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ SHOWN = [line.strip() for line in LINES if re.match(r"    (swarmctl|python3?) ",
 BIN = Path(sys.executable).parent
 WHILE_FLYING = (("status", "hold"), ("obstacle", "fault", "resume"), ("mission",), ("land",))  # near the start
 AFTERWARDS = ("report", "replay", "export")
+COARSE = ("--set=sitl.physics_hz=100", "--set=agent.rate_hz=25")
 CAMPAIGN = r"^swarmctl campaign "  # is run by tests/closed_loop/test_campaign.py
 
 
@@ -118,7 +119,8 @@ def test_the_two_set_up_lines_install_what_they_use() -> None:
 
 @pytest.mark.parametrize("line", shown(r"^swarmctl simulate "))
 def test_simulations(line: str, begun: Path, tmp_path: Path) -> None:
-    done = run(line, "--duration", "2", "--set=sitl.start=air", "--run-dir", str(tmp_path / "run"), folder=begun)
+    shorter = ("--duration", "2", "--set=sitl.start=air", *COARSE)
+    done = run(line, *shorter, "--run-dir", str(tmp_path / "run"), folder=begun)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "x real time" in done.stdout
 
@@ -185,7 +187,17 @@ def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:
     directory = tmp_path / "run"
     command, *arguments = shlex.split(line)
     flying = subprocess.Popen(
-        [str(BIN / command), *arguments, "--no-view", "--duration", "60", low(line), "--run-dir", str(directory)],
+        [
+            str(BIN / command),
+            *arguments,
+            "--no-view",
+            "--duration",
+            "60",
+            low(line),
+            *COARSE,
+            "--run-dir",
+            str(directory),
+        ],
         cwd=ROOT,
         env=environment() | {"TMPDIR": str(tmp_path)} if len(str(tmp_path)) < 40 else environment(),
         stdout=subprocess.PIPE,
@@ -249,7 +261,11 @@ def test_vehicles_of_another_process(tmp_path: Path) -> None:
     (line,) = shown(r"^swarmctl launch configs/px4_udp")
     command, *arguments = shlex.split(simulator)
     vehicles = subprocess.Popen(
-        [str(BIN / command), *arguments], cwd=ROOT, stdout=subprocess.PIPE, text=True, start_new_session=True
+        [str(BIN / command), *arguments, "--physics-hz", "100"],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
     try:
         assert vehicles.stdout is not None
@@ -263,7 +279,8 @@ def test_vehicles_of_another_process(tmp_path: Path) -> None:
         assert "stand closer than they may fly" in asked.stdout
         assert "COM_OBL_RC_ACT: 0 -> 4" in asked.stdout
         near = "--set=start.center_ned_m=[0,0,-1]"  # above the ground of those vehicles
-        done = run(line, "--no-view", "--duration", "2", near, "--run-dir", str(tmp_path / "run"), *urls)
+        shorter = ("--no-view", "--duration", "2", near, *COARSE)
+        done = run(line, *shorter, "--run-dir", str(tmp_path / "run"), *urls)
         assert done.returncode == 0, done.stdout + done.stderr
     finally:
         vehicles.terminate()
