@@ -20,6 +20,7 @@ from swarmctl.control.estimation.constant_velocity import (
     predict_without_setpoints,
 )
 from swarmctl.control.estimation.gust import GustWatch
+from swarmctl.core.autopilot_stop import ANSWER_S, BRAKE_M_S2
 from swarmctl.core.trajectory import grid
 from swarmctl.core.types import MAX_MARGIN_M, Array, FlightMode, Plan, PredictedPath, VehicleState
 
@@ -105,7 +106,7 @@ class PathPublisher:
         coasts_s = self._ports.autopilot.landing_delay_s
         if coasts_s is None or self._ports.autopilot.setpoint_loss_s is None or state.mode is not FlightMode.EXTERNAL:
             return False
-        brakes_s = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)) / self._setup.separation.brake_m_s2
+        brakes_s = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)) / BRAKE_M_S2 + ANSWER_S
         return self._ports.clock.now_us() - state.t_us <= (coasts_s + brakes_s) * 1e6
 
     def _path(self, state: VehicleState, flown: Plan | None, seq: int, margin_m: float) -> PredictedPath:
@@ -152,9 +153,8 @@ class PathPublisher:
         if self._flown is None or self._flown[1] <= state.t_us:
             return deaf, 0.0
         plan, last_us = self._flown
-        half = 0.5 * (predict_after_setpoints(plan, last_us, self._ahead_s(t0_us, last_us), **limits) - deaf)
-        soon = half[: 1 + round(_DOUBT_US / self._dt_us)]
-        return deaf + half, math.sqrt(float((soon * soon).sum(axis=1).max()))
+        heard = predict_after_setpoints(plan, last_us, self._ahead_s(t0_us, last_us), **limits)
+        return _middle(heard, deaf, self._dt_us)
 
     def _unheard(self, state: VehicleState, flown: Plan, heard_us: int) -> tuple[Array, float]:
         """Return positions (N, 3), NED [m], of a vehicle that misses setpoints, and how far it may be off [m].
@@ -174,10 +174,15 @@ class PathPublisher:
             coasts_s=max(0.0, coasts_s - kept_s),
             brake_m_s2=self._setup.separation.brake_m_s2,
         )
-        half = 0.5 * (flown.pos_ned_m - deaf)
-        soon = half[: 1 + round(_DOUBT_US / flown.dt_us)]
-        return deaf + half, math.sqrt(float((soon * soon).sum(axis=1).max()))
+        return _middle(flown.pos_ned_m, deaf, flown.dt_us)
 
     def _ahead_s(self, t0_us: int, since_us: int) -> Array:
         """Return the times (N,) [s] of a path from `t0_us` on, counted from another time."""
         return grid(self._steps) * (self._dt_us * 1e-6) + (t0_us - since_us) * 1e-6
+
+
+def _middle(one_ned_m: Array, other_ned_m: Array, dt_us: int) -> tuple[Array, float]:
+    """Return the middle of two ways, (N, 3) each, that a vehicle may take, and how far off it either is soon [m]."""
+    half = 0.5 * (one_ned_m - other_ned_m)
+    soon = half[: 1 + round(_DOUBT_US / dt_us)]
+    return other_ned_m + half, math.sqrt(float((soon * soon).sum(axis=1).max()))

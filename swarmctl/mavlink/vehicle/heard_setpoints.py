@@ -2,13 +2,13 @@
 
 A link may fail towards the vehicle alone. Its states go on to arrive, and look as if it followed, until its failsafe
 acts half a second later or more. An ArduCopter repeats the last setpoint that it has heard, a PX4 each one once. In 11
-flights all 5400 repeated setpoints were among those sent, none older than the second newest.
+flights 2811 of 2816 were among those sent, none older than the second newest; five were the autopilot's own.
 """
 
 from __future__ import annotations
 
+import itertools
 import struct
-from bisect import bisect_right
 from collections import deque
 
 _KEPT = 128  # setpoints: longer than any autopilot waits for the next one
@@ -75,5 +75,5 @@ class HeardSetpoints:
     def _missed(self, told_us: int) -> int:
         """Return how many setpoints the vehicle should have heard by now after that one, by what arrived at a time."""
         until_us = told_us - max(self.round_trip_us, min(self._took_us))
-        times_us = [t_us for t_us, _ in self._sent]
-        return bisect_right(times_us, until_us) - bisect_right(times_us, self._flown_us)
+        later_us = itertools.takewhile(lambda t_us: t_us > self._flown_us, (t_us for t_us, _ in reversed(self._sent)))
+        return sum(t_us <= until_us for t_us in later_us)
