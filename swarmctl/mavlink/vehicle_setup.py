@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 
 from swarmctl.core.types import Command, Verb
 from swarmctl.mavlink.commands import CommandPort, CommandResult
-from swarmctl.mavlink.dialects.dialect import GPS_GLOBAL_ORIGIN, Dialect
+from swarmctl.mavlink.dialects.dialect import ATTITUDE_TARGET, GPS_GLOBAL_ORIGIN, Dialect
 from swarmctl.mavlink.vehicle.autopilot import Autopilot
 
 _ORIGIN_EVERY_US = 1_000_000
@@ -22,6 +22,7 @@ _WATCH_US = 2_000_000
 _WATCH_MAX_US = 30_000_000  # a link that can't carry the rate is asked ever less often
 _SILENT_US = 1_200_000  # not even a heartbeat: the vehicle can't answer
 _ENOUGH_01 = 0.5
+_REPEATED_HZ = 50.0  # of ATTITUDE_TARGET in flight, by which setpoints are known to be heard
 
 
 class VehicleSetup:
@@ -70,6 +71,7 @@ class VehicleSetup:
         self._watched_us = 0
         self._watch_us = _WATCH_US
         self._samples = 0
+        self._repeated_hz: dict[int, float] = {}  # instead of the dialect's rate, once setpoints are sent
         self.ready = self.restored = False
 
     @property
@@ -125,6 +127,7 @@ class VehicleSetup:
             if now_us < self.restore_from_us:
                 return
         elif self.ready:
+            self._have_repeated()
             self._watch(now_us)
         elif not self._todo:
             self._compare()
@@ -140,6 +143,7 @@ class VehicleSetup:
         self._boots, self._dialect, self.ready = autopilot.clock.boots, autopilot.dialect, False
         self._compared = False
         self._failed.clear()
+        self._repeated_hz = {}
         self._setup = {**self._dialect.given, **self._given}
         if self._dialect.heeds_parameter:
             self._setup[self._dialect.heeds_parameter] = self._sysid
@@ -173,9 +177,14 @@ class VehicleSetup:
 
     def _rates(self, dialect: Dialect) -> list[Command]:
         state = [Command(verb=Verb.RATE, value=self._rate_hz, number=number) for number in dialect.state]
-        return state + [
-            Command(verb=Verb.RATE, value=rate_hz, number=number) for number, rate_hz in dialect.rates_hz.items()
-        ]
+        others_hz = {**dialect.rates_hz, **self._repeated_hz}
+        return state + [Command(verb=Verb.RATE, value=rate_hz, number=number) for number, rate_hz in others_hz.items()]
+
+    def _have_repeated(self) -> None:
+        """Have the vehicle repeat its setpoints as fast as they come, from the first one on."""
+        if self._autopilot.setpoints.sent_us is not None and not self._repeated_hz:
+            self._repeated_hz = {ATTITUDE_TARGET: _REPEATED_HZ}
+            self._todo.append(Command(verb=Verb.RATE, value=_REPEATED_HZ, number=ATTITUDE_TARGET))
 
     def _setting(self, name: str, value: float) -> Command:
         """Return the request for a value in the type in which the vehicle stores it."""

@@ -19,7 +19,7 @@ from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
 from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.control.reference.heading import Heading
 from swarmctl.core.frames import euler_from_quat
-from swarmctl.core.types import FlightMode, Mode, Phase, VehicleState
+from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import PipeTransport
@@ -56,7 +56,7 @@ def test_a_landing_at_speed_among_others_brakes_and_moves_apart_first(fly: Fly) 
 def test_negative_control_an_autopilot_that_lands_at_speed_among_others_comes_too_close(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def land_at_once(mission: MissionState, now_us: int, state: VehicleState) -> None:
+    def land_at_once(mission: MissionState, *_: object) -> None:
         if mission.stop_verb:
             mission.outcome, mission.phase = "stopped", Phase.LAND
 

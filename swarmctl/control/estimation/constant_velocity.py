@@ -26,15 +26,19 @@ def predict_constant_velocity(state: VehicleState, ahead_s: Array, brake_m_s2: f
     """Return positions (N, 3), NED [m], at `ahead_s` (N,) after a state.
 
     The velocity is reduced where the vehicle `stops`, as autopilots do but at `brake_m_s2` at most. Otherwise it is
-    continued; where somebody steers, it changes as the tilt says first.
+    continued; where somebody steers, it changes as the tilt says first. The tilt of who hovers says what wind there is.
     """
     ahead_s = np.maximum(ahead_s, 0.0)
-    if stops:
+    if stops and math.hypot(*state.vel_ned_m_s[:2]) < CREEP_M_S:
+        speed_m_s = _speed_m_s(state)
+        t_s = np.minimum(ahead_s, speed_m_s / brake_m_s2)
+        ahead_s = t_s - 0.5 * brake_m_s2 * t_s * t_s / max(speed_m_s, 1e-6)  # to travel as far at the present speed
+    elif stops:
         brake_m_s2 = min(brake_m_s2, HOLD_BRAKE_M_S2 if state.mode is FlightMode.HOLD else BRAKE_M_S2)
         motion = (state.vel_ned_m_s, _level_accel_ned_m_s2(state))
         return state.pos_ned_m + settling_displacement(*motion, ahead_s, brake_m_s2=brake_m_s2)
     pos = state.pos_ned_m + ahead_s[:, None] * state.vel_ned_m_s
-    if is_steered(state):
+    if not stops and is_steered(state):
         steered_s = np.minimum(ahead_s, _STEERED_S)
         pos += (steered_s * (ahead_s - 0.5 * steered_s))[:, None] * _level_accel_ned_m_s2(state)
     return np.asarray(pos)

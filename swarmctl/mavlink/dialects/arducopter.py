@@ -123,7 +123,7 @@ ARDUCOPTER = Dialect(
     rates_hz={
         SYS_STATUS: 5.0,
         EXTENDED_SYS_STATE: 10.0,
-        ATTITUDE_TARGET: 50.0,  # by it a vehicle is known to hear its setpoints, see `heard_setpoints.py`
+        ATTITUDE_TARGET: 5.0,
         GPS_RAW_INT: 5.0,  # a missing fix is seen by it first: its EKF lands 8 s later
         GLOBAL_POSITION_INT: 2.0,
     },

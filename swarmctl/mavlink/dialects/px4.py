@@ -130,7 +130,7 @@ PX4 = Dialect(
     integers_bytewise=True,
     state=(ODOMETRY,),
     rates_hz={
-        ATTITUDE_TARGET: 50.0,  # by it a vehicle is known to hear its setpoints, see `heard_setpoints.py`
+        ATTITUDE_TARGET: 5.0,
         EXTENDED_SYS_STATE: 10.0,
         CURRENT_MODE: 50.0,  # interval at which PX4 looks for a change; it is sent at 2 Hz and on change
         ESTIMATOR_STATUS: 1.0,  # flags and accuracy: by them a lost position is seen

@@ -49,7 +49,7 @@ def integrated_m(
     return way_m, vel_m_s
 
 
-@pytest.mark.parametrize("speed_m_s", [0.5, 2.0, 4.0])
+@pytest.mark.parametrize("speed_m_s", [0.6, 2.0, 4.0])
 @pytest.mark.parametrize("accel_m_s2", [-2.0, 0.0, 2.0])
 @pytest.mark.parametrize("mode", [FlightMode.LAND, FlightMode.HOLD])
 def test_who_stops_turns_its_acceleration_into_braking(speed_m_s: float, accel_m_s2: float, mode: FlightMode) -> None:
@@ -75,6 +75,17 @@ def test_ways_to_rest_are_those_of_real_autopilots_that_land(speed_m_s: float, m
 def test_who_brakes_more_softly_is_taken_to() -> None:
     way_m = predict_constant_velocity(STATE, np.array([9.0]), 1.0, stops=True)[0, 0] - STATE.pos_ned_m[0]
     assert way_m == pytest.approx(2.0 * ANSWER_S + 2.0, abs=0.05)
+
+
+def test_who_hovers_in_wind_is_not_expected_where_its_tilt_points() -> None:
+    leaning = replace(
+        STATE,
+        vel_ned_m_s=np.array([0.2, 0.0, 0.0]),
+        q_nb=quat_from_euler(0.0, -0.3, 0.0),
+        mode=FlightMode.HOLD,
+    )
+    way_m = predict_constant_velocity(leaning, AHEAD_S, BRAKE_M_S2, stops=True)[:, 0] - STATE.pos_ned_m[0]
+    assert way_m[-1] == pytest.approx(0.2**2 / (2.0 * BRAKE_M_S2))
 
 
 def test_who_rests_is_predicted_to_rest() -> None:
