@@ -2,7 +2,7 @@
 
 Autopilots begin to brake late, and brake softly. True ways to rest of a PX4 1.18 (MPC_ACC_HOR = 3 m/s2) in LAND were
 0.3, 1.5 and 2.8 m from 0.8, 2.1 and 3.4 m/s, of an ArduCopter 4.6.3 0.5, 1.2 and 4.1 m from 1.0, 1.9 and 4.0 m/s. Here
-they are 0.3, 1.6 and 3.6, 0.5, 1.3 and 4.9 m; braking at once at 3 m/s2 gives 0.1, 0.7 and 1.9, 0.2, 0.6 and 2.6 m. In
+they are 0.3, 1.5 and 3.4, 0.4, 1.2 and 4.5 m; braking at once at 3 m/s2 gives 0.1, 0.7 and 1.9, 0.2, 0.6 and 2.6 m. In
 hold they need longer: 1.9 m from 2.1 m/s (PX4), 2.5 m from 2.0 m/s (BRAKE of ArduCopter).
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from swarmctl.core.types import Array
 
-BRAKE_M_S2 = 2.0  # on average, until it rests
+BRAKE_M_S2 = 2.2  # on average, until it rests
 HOLD_BRAKE_M_S2 = 1.5
 ANSWER_S = 0.25  # in which an acceleration becomes another one, but for 1/e of it
 _AT_REST_M_S = 1e-6  # a slower velocity has no direction

@@ -78,20 +78,18 @@ def test_others_keep_clear_of_both_ways_that_a_link_may_have_failed(
     assert lost_amid_a_turn(after_s, config) < 0.65, "negative control"
 
 
-@pytest.mark.parametrize(
-    ("after_s", "config", "least_m"), [(2.3, ARDUCOPTERS, 0.85), (2.6, None, 0.8)], ids=["arducopter", "px4"]
-)
+@pytest.mark.parametrize(("after_s", "config"), [(2.9, ARDUCOPTERS), (2.6, None)], ids=["arducopter", "px4"])
 def test_others_keep_clear_of_where_a_vehicle_that_misses_its_setpoints_flies(
-    after_s: float, config: Path | None, least_m: float, monkeypatch: pytest.MonkeyPatch
+    after_s: float, config: Path | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its states go on to arrive: that it does not follow is seen by the setpoint that it repeats.
 
     Of 24 flights from shifted starts (six times, two agents) ArduCopters come to 0.85 m, without this to 0.67 m; the
-    vehicles of the thesis with PX4, which accelerate harder, to 0.63 and 0.55 m, 12 and 19 of them below 0.85 m.
+    vehicles of the thesis with PX4, which turn harder, to 0.62 and 0.39 m, 12 and 19 of them below 0.85 m.
     """
-    assert lost_amid_a_turn(after_s, config, "to_vehicle") >= least_m
+    assert lost_amid_a_turn(after_s, config, "to_vehicle") >= 0.85
     monkeypatch.setattr(HeardSetpoints, "unheard_since_us", lambda *times: None)
-    assert lost_amid_a_turn(after_s, config, "to_vehicle") < 0.7, "negative control"
+    assert lost_amid_a_turn(after_s, config, "to_vehicle") < 0.76, "negative control"
 
 
 def least_with_a_filling_link_m() -> float:

@@ -69,7 +69,7 @@ def test_who_stops_turns_its_acceleration_into_braking(speed_m_s: float, accel_m
 def test_ways_to_rest_are_those_of_real_autopilots_that_land(speed_m_s: float, measured_m: float) -> None:
     state = replace(STATE, vel_ned_m_s=np.array([speed_m_s, 0.0, 0.0]), mode=FlightMode.LAND)
     way_m = predict_constant_velocity(state, np.array([9.0]), 9.0, stops=True)[0, 0] - STATE.pos_ned_m[0]
-    assert 0.85 * measured_m < way_m < 1.35 * measured_m
+    assert 0.8 * measured_m < way_m < 1.2 * measured_m
 
 
 def test_who_brakes_more_softly_is_taken_to() -> None:
