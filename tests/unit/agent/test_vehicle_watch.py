@@ -24,11 +24,11 @@ class Watched:
     def __init__(self) -> None:
         self.events: list[dict[str, Any]] = []
         self.frame = SimpleNamespace(offset_ned_m=None)
-        ports = SimpleNamespace(
+        self.ports = SimpleNamespace(
             autopilot=SimpleNamespace(frame=self.frame), note=lambda name, **fields: self.events.append(fields)
         )
         self.alerts = Alerts()
-        self.watch = VehicleWatch(cast(Ports, ports), self.alerts)
+        self.watch = VehicleWatch(cast(Ports, self.ports), self.alerts)
 
     def answer(self, command: Command, ok: bool, text: str, now_us: int) -> str:
         """Take in the answer to a request; returns the alert."""
@@ -63,3 +63,16 @@ def test_what_else_is_refused_is_named_at_once_until_it_is_accepted() -> None:
     assert watched.answer(Command(verb=Verb.ARM), False, "temporarily rejected", SECOND) == (
         "arm refused: temporarily rejected"
     )
+
+
+def test_setpoints_that_the_vehicle_does_not_hear_are_told_while_they_are_not() -> None:
+    watched = Watched()
+    since_us: list[int | None] = [None]
+    watched.ports.autopilot.unheard_since_us = lambda now_us: since_us[0]
+    for now_us, unheard in ((0, None), (SECOND, 900_000), (SECOND + 20_000, 900_000), (2 * SECOND, None)):
+        since_us[0] = unheard
+        watched.watch.report_unheard(now_us)
+    assert watched.events == [{"unheard": True}, {"unheard": False}]
+    newest = watched.alerts.newest(SECOND + 20_000)
+    assert newest is not None
+    assert newest.text == "the vehicle does not hear its setpoints: its link fails one way"

@@ -7,12 +7,13 @@ import re
 import struct
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.core.clock import SimClock
 from swarmctl.core.json_safe import to_json
-from swarmctl.core.types import Command, FlightMode, GeoOrigin, Landed, Verb
+from swarmctl.core.types import AttitudeSetpoint, Command, FlightMode, GeoOrigin, Landed, Verb
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CommandPort, CommandResult
 from swarmctl.mavlink.framing import frames
@@ -151,6 +152,18 @@ def test_px4_is_set_up_in_two_seconds_and_left_alone_then() -> None:
     vehicle.asked.clear()
     vehicle.run(10.0)
     assert vehicle.asked == []
+
+
+def test_setpoints_are_to_be_repeated_as_fast_as_they_come_from_the_first_one_on() -> None:
+    vehicle = Vehicle().set_up().run(3.0)
+    assert vehicle.rates_hz[83] == pytest.approx(200_000.0)
+    now_us = vehicle.clock.now_us()
+    level = AttitudeSetpoint(q_nb=np.array(LEVEL), thrust_01=0.5, valid_until_us=now_us + 100_000)
+    assert vehicle.pilot.send(level, now_us) == ""
+    vehicle.asked.clear()
+    vehicle.run(5.0)
+    assert vehicle.asked == [(511, 83.0)]
+    assert vehicle.rates_hz[83] == pytest.approx(20_000.0)
 
 
 def test_arducopter_is_asked_for_every_message_the_bridge_needs() -> None:

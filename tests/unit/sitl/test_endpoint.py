@@ -159,6 +159,19 @@ def test_timesync_is_answered_with_the_time_of_its_arrival() -> None:
     assert sync.tc1 == pytest.approx(0.204e9, abs=1e7)
 
 
+def test_each_setpoint_is_repeated_once_in_offboard_and_targets_all_the_time_in_other_modes() -> None:
+    """As PX4 1.18 does: without new setpoints ATTITUDE_TARGET stops until the failsafe acts."""
+    client = Client(run_s=1.0)
+    client.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 20_000.0)
+    assert len(of("ATTITUDE_TARGET", client.run(1.0))) == pytest.approx(50, abs=1)
+    assert result(client.command(mav.MAV_CMD_DO_SET_MODE, 1.0, 6.0)) == 0
+    sent, told = [0.25, 0.5, 0.75], []
+    for thrust_01 in sent:
+        said = client.ask(mav.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1, 0, 0, 0], 0, 0, 0, thrust_01))
+        told += [message.thrust for message in of("ATTITUDE_TARGET", said + client.run(0.1))]
+    assert told == sent
+
+
 def test_old_texts_are_dropped() -> None:
     client = Client()
     client.command(400, 1)
