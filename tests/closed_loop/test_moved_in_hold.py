@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from sitl.lockstep import Lockstep
 from swarmctl.agent.sharing import path_publisher
-from swarmctl.control.estimation import constant_velocity
+from swarmctl.control.estimation import flown_by_others
 from swarmctl.core.types import Phase
 from swarmctl.mavlink.codec import Codec
 from tests.closed_loop.conftest import COARSE, Fly, mission_t_s
@@ -89,8 +89,8 @@ def steered(fly: Fly, settings: tuple[str, ...], legs: list[Leg], *, taken_s: fl
 
 def taken_to_stop(monkeypatch: pytest.MonkeyPatch, *, for_us: int = 1 << 62) -> None:
     """Take the vehicle to brake for so long in hold, and leave no room for who steers it."""
-    monkeypatch.setattr(constant_velocity, "_ENTERS_US", for_us)
-    for module in (constant_velocity, path_publisher):
+    monkeypatch.setattr(flown_by_others, "_ENTERS_US", for_us)
+    for module in (flown_by_others, path_publisher):
         monkeypatch.setattr(module, "is_steered", lambda state: False)
 
 

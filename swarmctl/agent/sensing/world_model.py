@@ -27,7 +27,7 @@ from swarmctl.control.collision.separation import (
     not_driving_away_m,
     without_setpoints,
 )
-from swarmctl.control.estimation.constant_velocity import CREEP_M_S
+from swarmctl.control.estimation.flown_by_others import CREEP_M_S
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory

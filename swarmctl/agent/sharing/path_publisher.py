@@ -11,12 +11,12 @@ from swarmctl.agent.sharing.far_paths import FarPaths
 from swarmctl.agent.sharing.path_sharing import PathSharing
 from swarmctl.bus import topics
 from swarmctl.control.controllers.kind import Controller
-from swarmctl.control.estimation.constant_velocity import (
+from swarmctl.control.estimation.flown_by_others import (
     STEERED_MARGIN_M,
     StopJudge,
     is_steered,
     predict_after_setpoints,
-    predict_constant_velocity,
+    predict_flown_by_others,
     predict_without_setpoints,
 )
 from swarmctl.control.estimation.gust import GustWatch
@@ -123,7 +123,7 @@ class PathPublisher:
             t0_us, dt_us = now_us + self._delay_us, self._dt_us
             if self._is_recent(state):
                 stops, ahead_s = self._stop_judge.update(state), self._ahead_s(t0_us, state.t_us)
-                pos = predict_constant_velocity(state, ahead_s, self._setup.separation.brake_m_s2, stops=stops)
+                pos = predict_flown_by_others(state, ahead_s, self._setup.separation.brake_m_s2, stops=stops)
                 margin_m += 0.0 if stops or not is_steered(state) else STEERED_MARGIN_M
             else:
                 pos, apart_m = self._without_link(state, t0_us)

@@ -26,7 +26,7 @@ from swarmctl.bus.messages.json_messages import (
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.bus.topics import OPERATOR, Topic
 from swarmctl.config import Config
-from swarmctl.control.estimation.constant_velocity import StopJudge, predict_constant_velocity
+from swarmctl.control.estimation.flown_by_others import StopJudge, predict_flown_by_others
 from swarmctl.control.model import Predictor
 from swarmctl.control.phases.steps.tracking import BEGIN_DELAY_US
 from swarmctl.core.operator_verbs import MISSION, OPERATOR_VERBS
@@ -188,7 +188,7 @@ def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np
             state = _state(row)
             ahead_s = (at_us - state.t_us).astype(np.float64) * 1e-6
             stops = stop_judge.update(state)
-            pos = predict_constant_velocity(state, ahead_s, config.separation.brake_m_s2, stops=stops)
+            pos = predict_flown_by_others(state, ahead_s, config.separation.brake_m_s2, stops=stops)
         else:
             continue
         path = PredictedPath(

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarmctl.control.estimation.constant_velocity import (
+from swarmctl.control.estimation.flown_by_others import (
     StopJudge,
     predict_after_setpoints,
-    predict_constant_velocity,
+    predict_flown_by_others,
     predict_without_setpoints,
 )
 from swarmctl.core.autopilot_stop import ANSWER_S, BRAKE_M_S2, HOLD_BRAKE_M_S2
@@ -27,12 +27,12 @@ STATE = builders.vehicle_state(
 
 
 def test_under_a_pilot_the_velocity_is_continued_after_it_has_changed_as_the_tilt_says() -> None:
-    assert predict_constant_velocity(STATE, AHEAD_S, BRAKE_M_S2, stops=False)[-1] == pytest.approx([7.0, 2.0, -3.0])
+    assert predict_flown_by_others(STATE, AHEAD_S, BRAKE_M_S2, stops=False)[-1] == pytest.approx([7.0, 2.0, -3.0])
     tilted = replace(STATE, q_nb=quat_from_euler(0.0, -np.arctan(0.1), 0.0))
     gained_m = 0.1 * GRAVITY_M_S2 * (0.5 * 0.4**2 + 0.4 * 2.6)
-    assert predict_constant_velocity(tilted, AHEAD_S, 9.0, stops=False)[-1, 0] == pytest.approx(7.0 + gained_m)
+    assert predict_flown_by_others(tilted, AHEAD_S, 9.0, stops=False)[-1, 0] == pytest.approx(7.0 + gained_m)
     climbs = replace(tilted, mode=FlightMode.TAKEOFF)
-    assert predict_constant_velocity(climbs, AHEAD_S, 9.0, stops=False)[-1, 0] == pytest.approx(7.0)
+    assert predict_flown_by_others(climbs, AHEAD_S, 9.0, stops=False)[-1, 0] == pytest.approx(7.0)
 
 
 def integrated_m(
@@ -56,7 +56,7 @@ def test_who_stops_turns_its_acceleration_into_braking(speed_m_s: float, accel_m
     q_nb = quat_from_euler(0.0, -np.arctan(accel_m_s2 / GRAVITY_M_S2), 0.0)
     state = replace(STATE, vel_ned_m_s=np.array([speed_m_s, 0.0, 0.0]), q_nb=q_nb, mode=mode)
     brake_m_s2 = HOLD_BRAKE_M_S2 if mode is FlightMode.HOLD else BRAKE_M_S2
-    way_m = (predict_constant_velocity(state, AHEAD_S, 9.0, stops=True) - STATE.pos_ned_m) @ [1.0, 0.0, 0.0]
+    way_m = (predict_flown_by_others(state, AHEAD_S, 9.0, stops=True) - STATE.pos_ned_m) @ [1.0, 0.0, 0.0]
     for ahead_s, reached_m in zip(AHEAD_S[::5], way_m[::5], strict=True):
         expected_m, _ = integrated_m(speed_m_s, [(0.0, -brake_m_s2)], accel_m_s2=accel_m_s2, until_s=ahead_s)
         assert reached_m == pytest.approx(expected_m, abs=0.06)
@@ -68,12 +68,12 @@ def test_who_stops_turns_its_acceleration_into_braking(speed_m_s: float, accel_m
 )
 def test_ways_to_rest_are_those_of_real_autopilots_that_land(speed_m_s: float, measured_m: float) -> None:
     state = replace(STATE, vel_ned_m_s=np.array([speed_m_s, 0.0, 0.0]), mode=FlightMode.LAND)
-    way_m = predict_constant_velocity(state, np.array([9.0]), 9.0, stops=True)[0, 0] - STATE.pos_ned_m[0]
+    way_m = predict_flown_by_others(state, np.array([9.0]), 9.0, stops=True)[0, 0] - STATE.pos_ned_m[0]
     assert 0.8 * measured_m < way_m < 1.2 * measured_m
 
 
 def test_who_brakes_more_softly_is_taken_to() -> None:
-    way_m = predict_constant_velocity(STATE, np.array([9.0]), 1.0, stops=True)[0, 0] - STATE.pos_ned_m[0]
+    way_m = predict_flown_by_others(STATE, np.array([9.0]), 1.0, stops=True)[0, 0] - STATE.pos_ned_m[0]
     assert way_m == pytest.approx(2.0 * ANSWER_S + 2.0, abs=0.05)
 
 
@@ -84,13 +84,13 @@ def test_who_hovers_in_wind_is_not_expected_where_its_tilt_points() -> None:
         q_nb=quat_from_euler(0.0, -0.3, 0.0),
         mode=FlightMode.HOLD,
     )
-    way_m = predict_constant_velocity(leaning, AHEAD_S, BRAKE_M_S2, stops=True)[:, 0] - STATE.pos_ned_m[0]
+    way_m = predict_flown_by_others(leaning, AHEAD_S, BRAKE_M_S2, stops=True)[:, 0] - STATE.pos_ned_m[0]
     assert way_m[-1] == pytest.approx(0.2**2 / (2.0 * BRAKE_M_S2))
 
 
 def test_who_rests_is_predicted_to_rest() -> None:
     resting = replace(STATE, vel_ned_m_s=np.zeros(3), mode=FlightMode.HOLD)
-    assert predict_constant_velocity(resting, AHEAD_S, BRAKE_M_S2, stops=True) == pytest.approx(
+    assert predict_flown_by_others(resting, AHEAD_S, BRAKE_M_S2, stops=True) == pytest.approx(
         np.tile(STATE.pos_ned_m, (len(AHEAD_S), 1))
     )
 

@@ -1,4 +1,4 @@
-"""Prediction of a vehicle that its autopilot or a pilot flies: straight on, or braking where it comes to rest."""
+"""Prediction of a vehicle that its autopilot or a pilot flies: straight on, braking to rest, or without setpoints."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LEAST_COS = 0.5  # of a tilt that is kept
 _BRAKES_M_S = 0.2  # by which the speed of one that brakes falls in that time
 
 
-def predict_constant_velocity(state: VehicleState, ahead_s: Array, brake_m_s2: float, *, stops: bool) -> Array:
+def predict_flown_by_others(state: VehicleState, ahead_s: Array, brake_m_s2: float, *, stops: bool) -> Array:
     """Return positions (N, 3), NED [m], at `ahead_s` (N,) after a state.
 
     The velocity is reduced where the vehicle `stops`, as autopilots do but at `brake_m_s2` at most. Otherwise it is
