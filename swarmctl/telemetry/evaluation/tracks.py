@@ -185,7 +185,8 @@ def _reported_positions(rows: NDArray[np.void], time_field: str, at_us: NDArray[
 def unseen_spans(rows: NDArray[np.void], time_field: str) -> list[tuple[float, float]]:
     """Return the intervals in which an armed vehicle's position was stale or unknown, from known to known position.
 
-    Also unknown is what was between two ticks, or two states, that are too far apart to interpolate.
+    Also unknown is what was between two ticks, or two states, that are too far apart to interpolate. Between states it
+    begins at the older one: the ticks that bring them may follow each other.
     """
     if not len(rows):
         return []
@@ -196,7 +197,8 @@ def unseen_spans(rows: NDArray[np.void], time_field: str) -> list[tuple[float, f
     states_missing = (np.diff(t_us - age_us) > GAP_US) & armed[:-1] & armed[1:]
     hidden = unseen[:-1] | unseen[1:] | ticks_missing | states_missing  # (T - 1,) of the times between rows
     edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]])))
-    return [(float(t_us[first]), float(t_us[end])) for first, end in edges.reshape(-1, 2)]
+    begins_us = np.where(states_missing & ~ticks_missing, t_us[:-1] - age_us[:-1], t_us[:-1])
+    return [(float(begins_us[first]), float(t_us[end])) for first, end in edges.reshape(-1, 2)]
 
 
 def interpolate(at_us: NDArray[np.int64], t_us: NDArray[np.int64], values: Array, gap_us: int) -> Array:

@@ -393,6 +393,14 @@ def test_what_can_not_be_interpolated_is_unseen_and_nothing_else(missing: int, a
     assert bool(unseen_spans(rows, "utc_us")) is is_hidden
 
 
+def test_states_too_far_apart_are_unseen_from_the_older_one_on() -> None:
+    """Every state is younger than 0.5 s at its tick, and 0.52 s pass between two of them."""
+    late = ticks(20, (0.0, 0.0, 0.0))
+    late["state_age_ms"][500:526] = 20.0 * np.arange(26)
+    unseen = evaluate(run({0: late}), Rules(agents=1, required_separation_m=0.85), "failed")["violations"]
+    assert "agent 0 did not know where its armed vehicle was for 0.5 s, from 10.0 s on" in unseen[0]
+
+
 def test_a_vanished_vehicle_is_named_and_not_judged_by_its_last_position() -> None:
     summary = evaluate(vanishing(heard=False), Rules(agents=2, required_separation_m=0.85), "failed")
     assert summary["separation"]["min_m"] == pytest.approx(5.4)  # at 5 s, the last that is known
