@@ -361,6 +361,7 @@ class Agent:
             excused=self._world_model.excused,
             others_ned_m=others_ned_m,
             obstacles=self._world_model.obstacles.at_rest,
+            moving_obstacles=partial(self._world_model.obstacles.moving, utc_us),
             arm_in=None if autopilot.dialect is None else autopilot.dialect.arm_in,
             boots=autopilot.clock.boots,
             refusal=self._vehicle_setup.refusal if phase <= Phase.ARM else "",

@@ -15,6 +15,7 @@ from swarmctl.core.params import OTHER_KEY, Params
 from swarmctl.core.types import Array
 
 MAX_OBSTACLE_M = 10_000.0  # limit of every coordinate
+_STEP_S = 0.05  # between the times at which the way of a moving one is looked at
 _Coordinate = Annotated[float, Field(ge=-MAX_OBSTACLE_M, le=MAX_OBSTACLE_M)]
 _Vector = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
 
@@ -87,6 +88,15 @@ class Obstacle(Params):
         north_m, east_m, down_m = pos_ned_m
         nearest = (north_m, east_m, max(self.center_ned_m[2], top_z_m))
         return (self.column or self.center_ned_m[2] < down_m) and self.distance_m(nearest) < self.keep_out_m
+
+    def will_cross(self, place_ned_m: Array | Sequence[float], end_z_m: float, within_s: float) -> bool:
+        """Return whether the keep-out will be, within a time, on the vertical from a place (3,) to a height, NED z."""
+        north_m, east_m, down_m = place_ned_m
+        highest_m, lowest_m = min(down_m, end_z_m), max(down_m, end_z_m)
+        centers = self.center_after(np.arange(0.0, within_s + _STEP_S, _STEP_S)[:, None])  # (T, 3)
+        nearest = np.array([north_m, east_m, 0.0]) + np.clip(centers[:, 2:], highest_m, lowest_m) * (0.0, 0.0, 1.0)
+        apart = (centers - nearest)[:, : self.axes]
+        return bool((apart * apart).sum(axis=1).min() < self.keep_out_m**2)
 
     def moved(self, elapsed_s: float) -> Obstacle:
         """Return the obstacle as it is after a time: at another centre if it moves."""

@@ -63,6 +63,10 @@ class KnownObstacles:
         """Return obstacles at rest that have been visible so far."""
         return [o for o in self._seen.values() if not o.moves]
 
+    def moving(self, utc_us: int) -> list[Obstacle]:
+        """Return the obstacles of the newest list that move, seen or not, as they are at a time."""
+        return [item.at(utc_us) for item in self.listed if item.obstacle.moves]
+
     def at_rest(self, pos_ned_m: Array) -> list[Obstacle]:
         """Return obstacles at rest that have been visible so far, or will be on the way straight down from (3,).
 

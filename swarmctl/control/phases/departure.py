@@ -15,6 +15,9 @@ LEAST_CLIMB_M = 0.5  # of a configuration
 _REFUSED_CLIMB_M = 0.25  # heights are estimates: a start at the least height must not be refused for a few centimetres
 _STOPPED_US = 3_000_000  # in hold below its height; a PX4 that has climbed goes on rising for a second in it
 _NEAR_M = 1.0  # PX4 ends a climb 0.8 m below its height (NAV_MC_ALT_RAD), and estimates drift
+_SPIN_UP_S = 6.0  # from arming to the climb
+_CLIMBS_M_S = 1.0  # of autopilots, at least
+_TAKES_CONTROL_S = 3.0  # from the end of the climb, or of a hold in it, to the first setpoint
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
 
 
@@ -37,7 +40,7 @@ def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[i
         return f"{names_of(absent)} to stand by"
     if slow := {agent for agent, peer in there.items() if peer.phase is Phase.STANDBY and not peer.keeps_up}:
         return f"the processor of {names_of(slow)} to keep up"
-    if state.landed is Landed.ON_GROUND and (obstacle := _obstacle_over(inputs, top_ned_m)):
+    if state.landed is Landed.ON_GROUND and (obstacle := _obstacle_over(inputs, state, top_ned_m)):
         return obstacle
     return "the autopilot's answers" if inputs.busy else ""
 
@@ -48,14 +51,25 @@ def unmet_climb_condition(inputs: PhaseInputs, state: VehicleState, top_ned_m: A
     The autopilot that climbs avoids nobody, and an order or a lost link may have delayed it.
     """
     if state.landed is Landed.ON_GROUND:
-        return inputs.unsettled or _obstacle_over(inputs, top_ned_m)
+        return inputs.unsettled or _obstacle_over(inputs, state, top_ned_m)
     above = (o for o in inputs.obstacles(top_ned_m) if o.is_above(state.pos_ned_m, float(top_ned_m[2])))
     return _to_go(next(above, None), top_ned_m)
 
 
-def _obstacle_over(inputs: PhaseInputs, top_ned_m: Array) -> str:
+def obstacle_coming(inputs: PhaseInputs, state: VehicleState, top_ned_m: Array) -> Obstacle | None:
+    """Return an obstacle that moves into the way of a climb to (3,), until the agent has control; None without one."""
+    top_z_m = float(top_ned_m[2])
+    spins_up_s = _SPIN_UP_S if state.landed is Landed.ON_GROUND else 0.0
+    climbs_s = max(0.0, float(state.pos_ned_m[2]) - top_z_m) / _CLIMBS_M_S
+    return inputs.crossing_obstacle(state.pos_ned_m, top_z_m, spins_up_s + climbs_s + _TAKES_CONTROL_S)
+
+
+def _obstacle_over(inputs: PhaseInputs, state: VehicleState, top_ned_m: Array) -> str:
     """Return which obstacle has to go before the autopilot, which avoids none, can climb to (3,), or ""."""
-    return _to_go(inputs.obstacle_below(top_ned_m, top_ned_m), top_ned_m)
+    if above := _to_go(inputs.obstacle_below(top_ned_m, top_ned_m), top_ned_m):
+        return above
+    coming = obstacle_coming(inputs, state, top_ned_m)
+    return "" if coming is None else f"an obstacle that moves to be past its climb (keep_out_m = {coming.keep_out_m:g})"
 
 
 def _to_go(obstacle: Obstacle | None, top_ned_m: Array) -> str:

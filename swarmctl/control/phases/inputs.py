@@ -38,6 +38,7 @@ class PhaseInputs:
     cut_off: str = ""  # why the mission must end here, because peers don't answer
     others_ned_m: Callable[[], Sequence[Array]] = tuple  # returns the present position (3,) of each peer
     obstacles: Callable[[Array], Sequence[Obstacle]] = lambda _: ()  # returns those at rest known at a position (3,)
+    moving_obstacles: Callable[[], Sequence[Obstacle]] = tuple  # returns those that move, where they are now
     arm_in: FlightMode | None = None  # flight mode required for arming; None: any
     boots: int = 0  # reboots of the autopilot so far
     refusal: str = ""  # reason why arming is refused for good, up to ARM
@@ -47,6 +48,11 @@ class PhaseInputs:
     escalation: Escalation = NOTHING_WORN  # response to what wears out: battery, link
     setpoints_stopped: str = ""  # by missed deadlines a moment ago, in words
     armed_told_us: int = -1  # arrival time of the HEARTBEAT that reported `state.armed`
+
+    def crossing_obstacle(self, place_ned_m: Array, end_z_m: float, within_s: float) -> Obstacle | None:
+        """Return an obstacle that moves onto the vertical from a place (3,) to a height, NED z, within a time."""
+        coming = (o for o in self.moving_obstacles() if o.will_cross(place_ned_m, end_z_m, within_s))
+        return next(coming, None)
 
     def obstacle_below(self, place_ned_m: Array, seen_from_ned_m: Array) -> Obstacle | None:
         """Return an obstacle, known at a position (3,), whose keep-out is on the vertical down from a place (3,)."""

@@ -72,6 +72,62 @@ def test_an_obstacle_that_goes_before_the_autopilot_holds_leaves_it_to_the_agent
     assert flight.at == "GOTO_START"
 
 
+PASSING = BALL.model_copy(update={"center_ned_m": (NORTH + 3.0, EAST, DOWN), "vel_ned_m_s": (-0.5, 0.0, 0.0)})
+
+
+def test_of_one_that_moves_into_its_way_the_agent_takes_control_and_keeps_clear_itself() -> None:
+    flight = climbing(PASSING)
+    assert flight.run(0.1) == [Verb.HOLD]
+    flight.flight_mode = FlightMode.HOLD
+    flight.run(0.3)
+    assert flight.at == "GOTO_START"
+    assert flight.mission.climb.cut_short
+
+
+@pytest.mark.parametrize(
+    "passing",
+    [
+        PASSING.model_copy(update={"vel_ned_m_s": (0.5, 0.0, 0.0)}),
+        PASSING.model_copy(update={"vel_ned_m_s": (-0.1, 0.0, 0.0)}),
+        PASSING.model_copy(update={"center_ned_m": (NORTH + 3.0, EAST + 1.3, DOWN)}),
+        PASSING.model_copy(update={"center_ned_m": (NORTH + 3.0, EAST, DOWN + 4.0)}),
+    ],
+    ids=["goes away", "comes too late", "passes beside it", "passes below it"],
+)
+def test_negative_control_what_does_not_come_into_its_way_leaves_it_to_its_autopilot(passing: Obstacle) -> None:
+    flight = climbing(passing)
+    assert flight.run(1.0) == []
+    assert flight.at == "TAKEOFF"
+
+
+def test_nothing_is_armed_while_one_is_about_to_cross_its_climb() -> None:
+    flight = in_phase(Phase.STANDBY)
+    flight.obstacles = (PASSING,)
+    assert flight.run(5.0) == []
+    assert flight.mission.waits_for == "an obstacle that moves to be past its climb (keep_out_m = 1.2)"
+    flight.obstacles = (PASSING.model_copy(update={"center_ned_m": (NORTH - 1.3, EAST, DOWN)}),)
+    assert Verb.ARM in flight.run(1.0)
+
+
+def above_its_place(obstacle: Obstacle) -> Flight:
+    """Return a flight that may be landed, 3 m high."""
+    flight = in_phase(Phase.GOTO_LAND)
+    flight.pos, flight.obstacles = START.copy(), (obstacle,)
+    return flight
+
+
+def test_the_autopilot_does_not_land_it_while_one_is_about_to_cross_its_way_down() -> None:
+    flight = above_its_place(PASSING)
+    assert Verb.LAND not in flight.run(5.0)
+    flight.obstacles = (PASSING.model_copy(update={"vel_ned_m_s": (-0.1, 0.0, 0.0)}),)
+    assert Verb.LAND in flight.run(1.0)
+
+
+def test_who_lacks_a_way_down_for_too_long_is_landed() -> None:
+    flight = above_its_place(PASSING)
+    assert Verb.LAND in flight.run(LONG_S)
+
+
 def test_an_operator_sends_it_on_by_hold_and_resume_under_the_agents_own_planner() -> None:
     flight = climbing(BALL)
     assert holds(flight)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from swarmctl.control.phases import handover
-from swarmctl.control.phases.departure import unmet_climb_condition
+from swarmctl.control.phases.departure import obstacle_coming, unmet_climb_condition
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.mission_state import SPIN_UP_US, MissionState
 from swarmctl.control.phases.trajectories import is_at
@@ -31,13 +31,16 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
     if others and mission.climb.was_ours and not mission.may_take_control:  # who was armed in another mode takes off
         handover.leave_control(mission, inputs)
         return []
-    mission.waits_for = unmet_climb_condition(inputs, state, mission.climb.rest_ned_m(state))
+    rest_ned_m = mission.climb.rest_ned_m(state)
+    mission.waits_for = unmet_climb_condition(inputs, state, rest_ned_m)
     if mission.held:
         return [] if others else _hold(mission, inputs, state)
     if mission.climb.abandoned:
         return _stop_above(mission, inputs, state)
-    if state.landed is not Landed.ON_GROUND and (mission.waits_for or mission.climb.waits):
-        return _wait_below(mission, inputs, state)
+    if state.landed is not Landed.ON_GROUND:
+        coming = obstacle_coming(inputs, state, rest_ned_m) is not None
+        if mission.waits_for or coming or mission.climb.waits:
+            return _wait_below(mission, inputs, state, coming)
     if mission.climb.is_stopped(inputs, state):
         if mission.climb.ends_near(state):
             mission.climb.cut()
@@ -61,12 +64,16 @@ def _hold(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> li
     return [Command(verb=Verb.HOLD)] if state.mode is not FlightMode.HOLD and mission.may_request(inputs) else []
 
 
-def _wait_below(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
-    """Have the autopilot hold below an obstacle; when that has gone, the agent flies the rest of the climb."""
-    if mission.waits_for:
+def _wait_below(mission: MissionState, inputs: PhaseInputs, state: VehicleState, coming: bool) -> list[Command]:
+    """Have the autopilot hold below an obstacle; the agent flies the rest of the climb.
+
+    It waits until one at rest has gone, but not for one that is `coming`, which the agent avoids by itself.
+    """
+    hovers = state.mode is FlightMode.HOLD
+    if mission.waits_for or (coming and not hovers):
         mission.climb.waits = True
         return _hold(mission, inputs, state)
-    if state.mode is FlightMode.HOLD:
+    if hovers:
         mission.climb.cut()
     return []
 

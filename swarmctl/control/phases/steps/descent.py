@@ -10,6 +10,8 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.mission_state import PLAN_MODES, TAKEN_OVER, MissionState
 from swarmctl.core.types import Command, FlightMode, Landed, Phase, VehicleState, Verb
 
+_DESCENDS_M_S = 0.5  # of autopilots that land, at least
+_TOUCHES_DOWN_S = 3.0  # from the ground on, until nothing turns any more
 _STANDS_US = 5_000_000  # that an autopilot has to disarm by itself
 
 
@@ -17,7 +19,8 @@ def goto_land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -
     """Fly to the landing place; after too long, land where the vehicle is.
 
     A vehicle that its autopilot still flies, as it was stopped before the agent had control, is landed by it where it
-    is, unless that would be on an obstacle.
+    is, unless that would be on an obstacle. Until then an agent that has control waits for an obstacle that moves to be
+    past the way down, on which the autopilot would not avoid it.
     """
     if mission.held:
         return []
@@ -28,13 +31,22 @@ def goto_land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -
     if not (controls or given_back) and inputs.now_us <= mission.land_by_us and inputs.is_over_obstacle(state):
         return handover.request_control(mission, inputs, state)
     if landing.is_reached(inputs, state, controls=controls, paused=mission.interruptions.paused):
-        mission.enter(Phase.LAND, inputs.now_us)
+        if inputs.now_us > mission.land_by_us or not (controls and _is_crossed(mission, inputs, state)):
+            mission.enter(Phase.LAND, inputs.now_us)
     elif inputs.now_us > mission.land_by_us:
         if landing.is_possible_here(inputs, state, controls=controls) or inputs.mode not in PLAN_MODES:
             mission.enter(Phase.LAND, inputs.now_us)
         else:
             mission.stop_in_place(inputs.now_us, state)
     return []
+
+
+def _is_crossed(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> bool:
+    """Return whether an obstacle moves onto the way straight down, before the vehicle would be on the ground."""
+    if mission.ground_z_m is None:
+        return False
+    descends_s = max(0.0, mission.ground_z_m - float(state.pos_ned_m[2])) / _DESCENDS_M_S
+    return inputs.crossing_obstacle(state.pos_ned_m, mission.ground_z_m, descends_s + _TOUCHES_DOWN_S) is not None
 
 
 def land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
