@@ -39,7 +39,7 @@ def _usable(solution: QpSolution) -> Array | None:
 
 
 class CondensedMpc:
-    """Solves one family of problems with fixed sparsity; `solve` is called every tick.
+    """Solves one family of problems with fixed sparsity, one of them every tick.
 
     Args:
         axes: weights and bounds of each axis.
@@ -94,7 +94,11 @@ class CondensedMpc:
 
     def solve(self, asked: AxesProblem, half_spaces: HalfSpaces | None = None) -> AxesSolution:
         """Solve one receding-horizon step, with at most `max_keep_outs` families of half-spaces; None for none."""
-        forecast, program = self.prediction.forecast(asked, half_spaces), self._program
+        return self.solve_from(self.prediction.forecast(asked, half_spaces))
+
+    def solve_from(self, forecast: Forecast) -> AxesSolution:
+        """Solve one receding-horizon step from its forecast, which has the half-spaces."""
+        program = self._program
         self._cost.fill(program.hessian, program.slope, forecast)
         program.fill(forecast)
         solution, solve_us = self.session.solve()

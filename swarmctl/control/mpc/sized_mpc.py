@@ -8,6 +8,7 @@ solver starts from its last answer, and a program whose rows come and go has an 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,11 +33,13 @@ class SizedMpc:
 
     def solve(self, asked: AxesProblem, half_spaces: HalfSpaces | None = None) -> AxesSolution:
         """Solve one receding-horizon step, with at most `max_keep_outs` families of half-spaces; None for none."""
+        forecast = self.prediction.forecast(asked, half_spaces)
         if half_spaces is not None and len(half_spaces.normal) > FEW:
-            half_spaces = within_reach(half_spaces, self.prediction, self.prediction.forecast(asked, None))
+            half_spaces = within_reach(half_spaces, self.prediction, forecast)
+            forecast = replace(forecast, half_spaces=half_spaces)
         needed = 0 if half_spaces is None else len(half_spaces.normal)
         room = min((room for room in self.sizes if room >= needed), default=max(self.sizes))
-        return self.sizes[room].solve(asked, half_spaces)
+        return self.sizes[room].solve_from(forecast)
 
 
 def rooms(most: int) -> list[int]:

@@ -149,11 +149,11 @@ def test_the_smallest_problem_with_room_is_solved(
     problem, solved = sized(), dict[int, int]()
     for size, found in problem.sizes.items():
 
-        def solve(problem: AxesProblem, near: HalfSpaces | None = None, size: int = size) -> AxesSolution:
-            assert near is not None
-            solved[size] = len(near.normal)
+        def solve(forecast: Forecast, size: int = size) -> AxesSolution:
+            assert forecast.half_spaces is not None
+            solved[size] = len(forecast.half_spaces.normal)
             return ANSWER
 
-        monkeypatch.setattr(found, "solve", solve)
+        monkeypatch.setattr(found, "solve_from", solve)
     assert problem.solve(step, spaces) is ANSWER
     assert solved == {room: within if given > FEW else given}
