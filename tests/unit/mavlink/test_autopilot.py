@@ -295,6 +295,18 @@ def test_a_pilot_who_takes_over_right_after_a_change_of_mode_is_believed_with_th
     assert bench.pilot.watch.departures == 2
 
 
+def test_a_change_that_a_heartbeat_and_a_mode_tell_at_once_is_believed() -> None:
+    """The mode before was told 0.1 s ago, so that the first of both contradicts it; a tick stamps them alike."""
+    bench = Bench().ready()
+    bench.heartbeat(PX4_HOLD)
+    flying(bench, 1.0, mode_hz=0.0)
+    bench.say(dialect.MAVLink_current_mode_message(0, PX4_HOLD, 0))
+    assert flying(bench, 0.1, mode_hz=0.0).mode is FlightMode.HOLD
+    bench.heartbeat(PX4_OFFBOARD)
+    bench.say(dialect.MAVLink_current_mode_message(0, PX4_OFFBOARD, 0))
+    assert bench.poll().mode is FlightMode.EXTERNAL
+
+
 def test_a_failsafe_that_came_and_went_between_two_polls_is_shown_once() -> None:
     bench = Bench().ready()
     flying(bench, 1.0)
