@@ -184,7 +184,10 @@ def test_recording_holds_what_was_published(endpoint: str, tmp_path: Path) -> No
         assert len(scalars(found[f"/plot/solve_ms/{agent}"])) == 100
         roll = np.array(scalars(found[f"/plot/att/{agent}/roll"]))
         assert np.allclose(np.radians(roll), [0.2, 0.1], atol=1e-6)  # setpoint first, then measured
-        assert 15 <= len(found[f"/world/plan/{agent}"]) <= 25
+        plans = [strips for row in found[f"/world/plan/{agent}"] for strips in row.values() if strips]
+        assert 5 <= len(plans) <= 25, "one for each time that the viewer looks, ten times a second if it can"
+        newest = np.array([np.cos(2 * np.pi * agent / AGENTS) / np.sqrt(3) + 0.99, -2.0])
+        assert np.allclose(np.array(plans[-1][0])[0, [0, 2]], newest, atol=1e-6), "that of the last tick"
         modes = [row[name] for row in found[f"/state/{agent}/mode"] for name in row if name.endswith("state")]
         assert ["REPLAY"] in modes
     least = np.array(scalars(found["/plot/separation/min"]))
