@@ -1,10 +1,10 @@
 """Compares the processor time of ticks with that of an older commit, both measured in turns in one run.
 
 `python tools/tick_ratio.py [--base COMMIT] [--limit 1.15]`. Two processes fly the same lockstep flights, one with the
-code of this checkout, the other with that of the commit, and take turns of a second of flight. Their ratio is the
-median over all turns, so that a busy machine or a change of its frequency hits both. Simulator and bus are counted with
-the agents. Exit code 1: a flight costs more than the limit times as much. The commit is that of `tools/tick_baseline`;
-whoever accepts a higher cost writes another one there.
+code of this checkout, the other with that of the commit, and take turns of a fifth of a second of flight. Their ratio
+is the median over all turns, so that a busy machine or a change of its frequency hits both. Simulator and bus are
+counted with the agents. Exit code 1: a flight costs more than the limit times as much. The commit is that of
+`tools/tick_baseline`; whoever accepts a higher cost writes another one there.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from statistics import quantiles
 
 ROOT = Path(__file__).parents[1]
 BASELINE = Path(__file__).parent / "tick_baseline"
-TURNS = 30
+TURNS = 150
 LIMIT = 1.15  # times the older cost
-STEPS = 50  # of a turn: a second
+STEPS = 10  # of a turn, a fifth of a second: load that others cause lasts longer, and hits both
 UNDER_WAY_STEPS = 400  # before the first turn: all agents are on the circle
 ENDLESS = "mission.duration_s=3600"
 FLIGHTS = {
