@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 
 LOITER, OFFBOARD = 0x03040000, 0x00060000
 PHASES = ("CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND", "LAND")
-CLIMBED_M, START_HEIGHT_M = 0.5, 2.0
+CLIMBED_M, START_HEIGHT_M, HIGH_M = 0.5, 2.0, 15.0
 MOVED_M_S = 2.0  # by a ground station, in hold
 STRAYED_M = 20.0  # from the middle of the circle; followed for 40 s, the lost position led 180 m away
 STOPPED_S = 60.0  # within which nothing is armed any more, or it is named
@@ -106,6 +106,28 @@ def test_what_a_pilot_lands_while_it_takes_off_stays_down(field: Fielder, kind: 
     assert launched.end(END_S) == EXIT_MISSION, launched.text()
     assert "pilot or autopilot took over" in launched.text()
     assert not vehicle.armed
+
+
+@pytest.mark.parametrize("kind", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
+def test_a_climb_keeps_clear_of_an_obstacle_that_moves_into_its_way(field: Fielder, kind: Kind) -> None:
+    """Its agent takes control on the way up."""
+    here = field(PX4, 1) if kind is PX4 else booted(field, 1)
+    high = f"start.positions_ned_m=[[0.0,0.0,{-HIGH_M}]]"
+    config = (PX4_CONFIG, *LONE_PX4) if kind is PX4 else (ARDUPILOT_CONFIG,)
+    launched = here.launch(*config, "--set", "mission.kind=hover", "--set", high, "--duration", "3")
+    launched.until_phase("TAKEOFF", 1)
+    vehicle = here.witness.vehicles[0]
+    here.witness.wait(lambda: vehicle.height_m() > CLIMBED_M, 30.0, "climbing")
+    moves = ("--radius", "0.5", "--keep-out", "1.0", "--visibility", "8", "--velocity=-2,0,0")
+    assert launched.verb("obstacle", "add", f"--center=9,0,{-0.7 * HIGH_M}", *moves).returncode == 0
+    assert launched.end(END_S) == 0, launched.text()
+    table = pq.read_table(launched.run_dir / "agent-0.parquet", columns=["phase", "pos_ned_m_z"])
+    taken = table.column("phase").to_numpy() == Phase.GOTO_START
+    below_m = HIGH_M + float(table.column("pos_ned_m_z").to_numpy()[taken][0])
+    clear = launched.summary()["obstacles"]
+    print(f"control {below_m:.1f} m below its height, {clear['min_clearance_m']:.2f} m from the centre")
+    assert below_m > 1.5
+    assert clear["min_clearance_m"] > clear["required_m"]
 
 
 def test_others_make_way_for_who_is_moved_in_hold(field: Fielder) -> None:
