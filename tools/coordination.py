@@ -28,7 +28,9 @@ from sitl.lockstep import Lockstep
 from sitl.studies.campaign.conditions.layouts import nudged
 from swarmctl.bus.bus import agent_name
 from swarmctl.config import load
+from swarmctl.control.mpc.axes import AxesSolution
 from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.prediction import Forecast
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array, Phase
 
@@ -98,20 +100,20 @@ def fly(case: Case) -> Flown:
     starts = nudged(np.array(load(path, sets).starts_ned_m()), case.start)
     lockstep = Lockstep(load(path, (*sets, f"start.positions_ned_m={json.dumps(starts.tolist())}")))
     solved_ns = list[int]()
-    solve = CondensedMpc.solve
+    solve = CondensedMpc.solve_from
 
-    def timed(mpc: CondensedMpc, asked: object, spaces: object = None) -> object:
+    def timed(mpc: CondensedMpc, forecast: Forecast) -> AxesSolution:
         began_ns = time.thread_time_ns()
-        found = solve(mpc, asked, spaces)  # type: ignore[arg-type]
-        if spaces is not None:
+        found = solve(mpc, forecast)
+        if forecast.half_spaces is not None:
             solved_ns.append(time.thread_time_ns() - began_ns)
         return found
 
-    CondensedMpc.solve = timed  # type: ignore[method-assign, assignment]
+    CondensedMpc.solve_from = timed  # type: ignore[method-assign, assignment]
     try:
         arrived_s = _until_arrived(lockstep, flight, -starts[:, :2])
     finally:
-        CondensedMpc.solve = solve  # type: ignore[method-assign]
+        CondensedMpc.solve_from = solve  # type: ignore[method-assign]
     apart_m = closest_pair_m(lockstep.truth.reshape(-1, len(starts))["pos_ned_m"])
     return Flown(
         arrived_s=arrived_s,
