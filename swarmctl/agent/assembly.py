@@ -89,6 +89,7 @@ def _setup_of(config: Config, agent: int, boot_id: int, originals: Mapping[str, 
         boot_id=boot_id,
         sysid=config.sysids()[agent],
         vouchers={OPERATOR: frozenset(range(swarm.agents)), **{h.name: frozenset(h.agents) for h in config.hosts}},
+        quorum=_quorum(config),
         params=config.agent,
         mission=config.mission,
         starts_ned_m=np.array(config.starts_ned_m()),
@@ -101,3 +102,16 @@ def _setup_of(config: Config, agent: int, boot_id: int, originals: Mapping[str, 
         drift_m=config.drift_m,
         originals=originals,
     )
+
+
+def _quorum(config: Config) -> int:
+    """Return how many agents one has to see on the bus, itself included, to take a silent one that has left for dead.
+
+    On one computer it is. From another computer it may be cut off, and fly on. Where routers pass on what others say,
+    the bus falls into parts that see none of each other, and one part at most has a majority: the others rest. Where
+    they don't, two computers may both see a third one and not each other, so nobody is taken for dead.
+    """
+    agents = config.swarm.agents
+    if len(config.hosts) < 2:
+        return 1
+    return agents // 2 + 1 if config.bus.relay else agents

@@ -116,6 +116,7 @@ def make_world_model(setup: AgentSetup, ports: Ports) -> WorldModel:
         rate_hz=setup.params.rate_hz,
         note=ports.note,
         vouchers=setup.vouchers,
+        quorum=setup.quorum,
     )
 
 

@@ -53,6 +53,7 @@ class WorldModel:
         bus: source of messages, drained by `listen`.
         rate_hz: tick rate of every agent.
         vouchers: agents of which each sender may say that they have ended.
+        quorum: see `AgentSetup`.
         note: receives the events `refused` (see `Refusals`), `obstacles_changed` with the list as it was received,
             `peer_ended` with the process that has, and `unresponsive`: a peer within reach is on the bus and has
             published no accepted path for `lost_after_s`; also when that ends, with its duration.
@@ -68,8 +69,10 @@ class WorldModel:
         rate_hz: float,
         note: Callable[..., None],
         vouchers: Mapping[str, Set[int]],
+        quorum: int = 1,
     ) -> None:
         self._agent, self._params, self._bus, self._note = agent, params, bus, note
+        self._quorum = quorum
         self._budget = params.budget
         self.refusals, self.presence = Refusals(note), Presence(bus)
         self.clocks = PeerClocks(peers, note)
@@ -366,8 +369,8 @@ class WorldModel:
         """Return whether some peer within reach is silent and not known to be dead: it may fly on, or our bus is lost.
 
         One may be silent for a while because messages are lost; that several are at once is noticed sooner.
-        A peer whose liveliness token has gone while ours is present has died, as far as best effort can know; its path
-        has become a keep-out.
+        A peer whose liveliness token has gone while those of a quorum, ours included, are present has died, as far as
+        best effort can know; its path has become a keep-out.
         """
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
         flying = [p.agent for p in self.paths.near(utc_us - _BUS_LOST_US) if not self.has_ended(p.agent)]
@@ -377,7 +380,9 @@ class WorldModel:
         if not silent:
             return False
         alive = self._bus.alive()
-        return agent_name(self._agent) not in alive or any(agent_name(agent) in alive for agent in silent)
+        if agent_name(self._agent) not in alive or any(agent_name(agent) in alive for agent in silent):
+            return True
+        return 1 + sum(agent_name(agent) in alive for agent in self._verifiers) < self._quorum
 
     def _flies_itself(self, agent: int) -> bool:
         """Return whether a peer's agent controls its vehicle, and so runs the same safety filter as ours."""

@@ -44,6 +44,7 @@ class Bench:
     clock: SimClock = field(default_factory=SimClock)
     events: list[dict[str, Any]] = field(default_factory=list)
     seq: int = 0
+    quorum: int = 1
 
     def __post_init__(self) -> None:
         self.hub = LocalHub(self.clock.now_us)
@@ -52,7 +53,7 @@ class Bench:
         note = lambda name, **fields: self.events.append({"event": name, **fields})  # noqa: E731
         vouchers = {topics.OPERATOR: {0, 1, 2}, "bravo": {1}}
         self.world_model = WorldModel(
-            0, [1, 2], SeparationParams(), self.bus, rate_hz=50.0, note=note, vouchers=vouchers
+            0, [1, 2], SeparationParams(), self.bus, rate_hz=50.0, note=note, vouchers=vouchers, quorum=self.quorum
         )
 
     def tick(self) -> list[str]:
@@ -206,6 +207,24 @@ def test_several_that_fall_silent_at_once_are_noticed_sooner_than_one(peers: int
         waited_us += TICK_US
         assert waited_us < 2_000_000
     assert waited_us * 1e-6 == pytest.approx(silent_s, abs=0.05)
+
+
+@pytest.mark.parametrize(("quorum", "may_fly_on"), [(1, False), (2, False), (3, True)])
+def test_a_silent_peer_that_has_left_counts_as_dead_where_enough_others_are_there(
+    quorum: int, may_fly_on: bool
+) -> None:
+    """From another computer it may be cut off, and fly on: who sees too few may be the one that is cut off."""
+    bench = Bench(quorum=quorum)
+    others = bench.hub.connect(agent_name(2))
+    bench.say_path()
+    bench.say_status()
+    bench.tick()
+    bench.peer.close()
+    bench.clock.advance(2_000_000)
+    assert bench.world_model.has_unresponsive_peer(bench.clock.utc_us()) is may_fly_on
+    bench.world_model.exclude(1)
+    assert not bench.world_model.has_unresponsive_peer(bench.clock.utc_us()), "somebody vouches for it"
+    others.close()
 
 
 @pytest.mark.parametrize("why", ["gone", "done"])
