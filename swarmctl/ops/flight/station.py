@@ -103,8 +103,9 @@ class SwarmWatch:
         note: is told of refused messages, see `Refusals`, of lists of obstacles, of senders' clocks, and of agents that
             were not waited for.
         vouchers: agents of which each sender may say that they have ended.
-        configured, list_setters, clock: see `ObstacleKeeper`.
-        clock_s: monotonic time [s].
+        configured, list_setters: see `ObstacleKeeper`.
+        clock: of this computer, by which its events are stamped too.
+        clock_s: time by which agents are silent [s]; it may stand still while this computer is suspended.
 
     Attributes:
         problems: what went wrong, in words.
@@ -128,9 +129,8 @@ class SwarmWatch:
     ) -> None:
         self._bus, self._display, self._clock_s = bus, display, clock_s
         self._report, self._note = BusReport(bus, note, display), note
-        self._obstacles = ObstacleKeeper(
-            bus, configured, clock or WallClock(), trusted=list_setters, refuse=self._report.refuse
-        )
+        self._clock = clock or WallClock()
+        self._obstacles = ObstacleKeeper(bus, configured, self._clock, trusted=list_setters, refuse=self._report.refuse)
         self._recorded_list: ObstaclesMessage | None = None
         self._views = [AgentView(agent=agent, received_s=clock_s()) for agent in range(agents)]
         self._numbers = {agent_name(agent): agent for agent in range(agents)}
@@ -199,7 +199,7 @@ class SwarmWatch:
 
     def _record_ticks(self) -> None:
         arrived = self._bus.receive(TICK)
-        arrival_us = round(1e6 * self._clock_s())  # not earlier than that of any of them
+        arrival_us = self._clock.now_us()  # not earlier than that of any of them
         for sender, payload in arrived:
             tick = unpack_tick(payload)
             if tick is not None:

@@ -26,6 +26,7 @@ from swarmctl.telemetry.recording.run_files import load_run
 from swarmctl.telemetry.recording.summary_file import decode_summary
 from swarmctl.telemetry.report.run_charts import RunCharts
 from swarmctl.telemetry.report.run_report import summary_rows
+from swarmctl.wall_clock import WallClock
 from tests.unit.telemetry.test_referee import UTC0_US, run, ticks
 
 RULES = Rules(agents=2, required_separation_m=0.85)
@@ -49,15 +50,20 @@ def crossing(least_m: float, ahead_s: float) -> list[NDArray[np.void]]:
 
 
 class Station:
-    """A station that is told of a flight, with delays of 3 ms and more, and looks for messages every 50 ms."""
+    """A station that is told of a flight, with delays of 3 ms and more, and looks for messages every 50 ms.
 
-    def __init__(self, folder: Path, flown: list[NDArray[np.void]]) -> None:
+    Its computer has been suspended for a while since it was started, in which one of its two monotonic clocks stood.
+    """
+
+    def __init__(self, folder: Path, flown: list[NDArray[np.void]], suspended_s: float = 0.0) -> None:
         self.now_s, self.events = BOOTED_US * 1e-6, list[dict[str, Any]]()
         names = [agent_name(agent) for agent in range(len(flown))]
         hub = LocalHub(lambda: round(1e6 * self.now_s))
         senders = [hub.connect(name) for name in names]
         bus = hub.connect("station", {STATUS: names, TICK: names, OBSTACLES: []})
-        watch = SwarmWatch(bus, len(flown), folder, PlainLines(StringIO()), self._note, lambda: self.now_s, vouchers={})
+        own = WallClock(lambda: round(1e9 * self.now_s), lambda: round(1e9 * self.now_s))
+        awake_s = lambda: self.now_s - suspended_s  # noqa: E731
+        watch = SwarmWatch(bus, len(flown), folder, PlainLines(StringIO()), self._note, awake_s, vouchers={}, clock=own)
         self._note("started", agents=[])
         rng = np.random.default_rng([1, 0, 0])
         for tick in range(len(flown[0])):
@@ -104,6 +110,12 @@ def test_clocks_that_were_corrected_are_told(tmp_path: Path) -> None:
     assert "; clocks corrected: agent 1 0.50 s ahead" in summary_lines(summary, tmp_path)[1]
     row = next(row for row in summary_rows(summary, RULES) if row.name.startswith("clocks"))
     assert row.value == "agent 1 0.50 s ahead"
+
+
+def test_a_station_on_a_computer_that_has_been_suspended_sets_no_clock_by_that(tmp_path: Path) -> None:
+    """All ticks were taken for those of an hour and a half before, and obstacles set in flight for later ones."""
+    summary = evaluate(Station(tmp_path, crossing(0.89, 0.0), suspended_s=5400.0).run, RULES, "completed")
+    assert [clock["ahead_s"] for clock in summary["clocks"]] == pytest.approx([0.0, 0.0], abs=0.01)
 
 
 def test_what_a_station_has_not_heard_is_not_laid_to_an_agent(tmp_path: Path) -> None:
