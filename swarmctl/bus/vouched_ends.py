@@ -42,11 +42,6 @@ class VouchedEnds:
         """Believe that this process of an agent has ended; None: one that was never heard."""
         self._is_down.setdefault(agent, {}).setdefault(boot_id, False)
 
-    @property
-    def agents(self) -> Set[int]:
-        """Return the agents of which a process has ended."""
-        return self._is_down.keys()
-
     def has_ended(self, agent: int, boot_id: int | None) -> bool:
         """Return whether this process of an agent has ended; None: of an agent that was never heard, any has."""
         known = self._is_down.get(agent, {})

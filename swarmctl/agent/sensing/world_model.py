@@ -80,6 +80,7 @@ class WorldModel:
         self._verifiers = peer_verifiers(peers, topics.STATUS, rate_hz, self.refusals, presence=self.presence)
         self._orders = Orders(agent, self.refusals)
         self._ends = VouchedEnds(vouchers)
+        self._excluded: set[int] = set()  # peers of which an operator has said that they have ended
         self._unresponsive_since_us: dict[int, int] = {}
         self._status: dict[int, StatusMessage] = {}
         self._status_us: dict[int, int] = {}  # UTC of the newest one's arrival
@@ -283,6 +284,7 @@ class WorldModel:
     def exclude(self, agent: int) -> None:
         """Believe that the process of a peer has ended; another process under its number takes part again."""
         self._ends.vouch(agent, self._boot_id(agent))
+        self._excluded.add(agent)
         self._ended = None
 
     def life_sign(self, agent: int, utc_us: int) -> str:
@@ -313,8 +315,11 @@ class WorldModel:
 
     @property
     def excused(self) -> frozenset[int]:
-        """Return the peers that have never been heard, and that nobody has to wait for: somebody vouches for it."""
-        return frozenset(self._ends.agents - self._status.keys())
+        """Return the peers that nobody waits for: they have never been heard, and an operator has excluded them.
+
+        That a process has ended, as who runs it says, lets nobody take off without it: an operator decides that.
+        """
+        return frozenset(self._excluded - self._status.keys())
 
     def _boot_id(self, agent: int) -> int | None:
         status = self._status.get(agent)

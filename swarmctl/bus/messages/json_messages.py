@@ -67,7 +67,7 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     alert_age_s: float  # since it began
     uses_commitments: bool  # it flies committed trajectories only, see `control.commit`
     utc_us: Count  # time of sending, by the agent's clock
-    without: Agents = ()  # peers that it does not wait for: it has never heard them, and somebody vouches for their end
+    without: Agents = ()  # peers that it does not wait for: it has never heard them, and an operator has excluded them
 
 
 class CommandMessage(msgspec.Struct, frozen=True):

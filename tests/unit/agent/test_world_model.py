@@ -493,6 +493,19 @@ def test_who_has_never_been_heard_is_excused_until_it_is_heard() -> None:
     assert not bench.world_model.has_ended(1), "this is another process than the one that was vouched for"
 
 
+@pytest.mark.parametrize("boot_id", [None, 7])
+def test_who_has_ended_before_it_was_heard_is_waited_for_until_an_operator_excludes_it(boot_id: int | None) -> None:
+    """Those who had heard it waited for it on the ground, and those who had not took off without it."""
+    bench = Bench()
+    ended = EndedMessage(agent=1, boot_id=boot_id, is_down=True)
+    bench.hub.carry("bravo", topics.ENDED, encode_message(ended))
+    bench.tick()
+    assert bench.world_model.has_ended(1)
+    assert bench.world_model.excused == set()
+    bench.world_model.exclude(1)
+    assert bench.world_model.excused == {1}
+
+
 def test_who_is_silent_for_long_is_no_company_though_its_token_stays() -> None:
     """A router may keep the token of a computer that was lost for good: nobody would end."""
     bench = Bench()
