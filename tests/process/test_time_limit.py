@@ -26,3 +26,15 @@ def test_a_flight_may_last_as_long_as_its_agents_say_and_no_longer(
     result = services.fly("mission.duration_s=1")
     assert result.outcome == outcome
     assert any("did not end within" in problem for problem in result.problems) == (outcome == "failed")
+
+
+@pytest.mark.parametrize("phase", [Phase.STANDBY, Phase.GOTO_START])
+def test_who_waits_for_others_or_is_held_before_the_mission_may_wait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: Phase
+) -> None:
+    """A host that waited for another one, with `start_timeout_s = 900`, was ended 325 s after its start."""
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_BEYOND_MISSION_S", 1.0)
+    services = ScriptedServices(tmp_path, [ends(0, 4.0)])
+    services.phase = phase
+    result = services.fly("mission.duration_s=1")
+    assert (result.outcome, result.problems) == ("completed", [])
