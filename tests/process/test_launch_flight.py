@@ -13,10 +13,16 @@ import pytest
 import swarmctl.ops.supervision.recovery
 import swarmctl.ops.supervision.supervisor
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.json_messages import decode_obstacles, encode_message, first_list
+from swarmctl.bus.messages.json_messages import (
+    EndedMessage,
+    decode_ended,
+    decode_obstacles,
+    encode_message,
+    first_list,
+)
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.topics import OBSTACLES, OPERATOR, Topic
+from swarmctl.bus.topics import ENDED, OBSTACLES, OPERATOR, Topic
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
@@ -298,6 +304,31 @@ def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
     began_s = time.monotonic()
     assert scene.fly().exit_code(violated=False) == EXIT_INTERRUPTED
     assert time.monotonic() - began_s < 10.0
+    assert {child.poll() for child in scene.children.values()} == {137}
+
+
+class RouterSeen(CountedBus):
+    """Notes whether the router ran when an end was told."""
+
+    def __init__(self, bus: Bus, router: Child) -> None:
+        super().__init__(bus)
+        self._router, self.ran = router, list[bool]()
+
+    def publish(self, topic: Topic, payload: bytes) -> None:
+        if topic is ENDED:
+            self.ran.append(self._router.poll() is None)
+        super().publish(topic, payload)
+
+
+def test_a_host_that_kills_its_agents_tells_the_other_hosts_by_a_router_that_still_runs(tmp_path: Path) -> None:
+    """They waited for these agents as for silent ones: of two hosts the other one landed, cut off."""
+    scene = ScriptedServices(tmp_path, [FLIES_LONG])
+    assert scene.bus is not None
+    scene.bus = seen = RouterSeen(scene.bus, scene.children[ROUTER])
+    scene.obeys, scene.act = False, lambda: setattr(scene, "interrupts", 2)
+    assert scene.fly("swarm.agents=3").exit_code(violated=False) == EXIT_INTERRUPTED
+    told = [decode_ended(payload) for _, payload in scene.agents[0].receive(ENDED)]
+    assert (told, seen.ran) == ([EndedMessage(agent=0, boot_id=1, is_down=False)], [True])
     assert {child.poll() for child in scene.children.values()} == {137}
 
 

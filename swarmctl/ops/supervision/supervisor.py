@@ -49,6 +49,7 @@ _LAND_S = 60.0  # for agents to land that are told to; later they are killed
 _LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
 _ROUTER_STARTS = 3  # in one flight
+_TOLD_S = 0.3  # in which the router passes on what it was told last
 _AFTER_DEATH_S = 3.0  # the simulator must outlive a dead agent until its vehicle has landed
 
 
@@ -142,11 +143,20 @@ class FlightSupervisor:
             time.sleep(_STEP_S)
         self._result.interrupted = True
         self._fail("killed", "interrupted twice: every process was killed, vehicles were left to their autopilots")
+        self._kill_everything()
+        return self._report_left_vehicles()
+
+    def _kill_everything(self) -> None:
+        """Kill every process; agents first, so that those of other computers are told of their ends."""
         running = self._running()
+        if len(self._views) < self._config.swarm.agents:
+            kill_all([self._services.children[agent_name(view.agent)] for view in running])
+            for view in running:
+                self._vouch_for_end(view, 128 + signal.SIGKILL)
+            time.sleep(_TOLD_S)
         kill_all(list(self._services.children.values()))
         if not self._config.sitl.enabled:
             self._recovery.give_up(running)
-        return self._report_left_vehicles()
 
     def _report_left_vehicles(self) -> LaunchResult:
         """Report every vehicle that is not known to be on the ground."""
