@@ -17,6 +17,6 @@ class StateMachineParams(Params):
     arrive_m_s: float = Field(0.15, gt=0, le=5)  # largest speed of a vehicle at rest
     land_m: float = Field(0.06, gt=0, le=5)  # tolerance of the landing place; reduces the gap to neighbouring places
     land_m_s: float = Field(0.06, gt=0, le=5)  # largest speed above the landing place
-    start_timeout_s: float = Field(90.0, gt=0, le=3600)  # from process start to TRACK
+    start_timeout_s: float = Field(90.0, gt=0, le=3600)  # from process start to arming, and from there to TRACK
     land_timeout_s: float = Field(20.0, gt=0, le=600)  # allowed delay at the landing place; then land where it is
     apart_m: float = Field(0.2, ge=0, le=20)  # beyond separation.radius_m, around an agent that lands in place

@@ -173,6 +173,19 @@ def test_temporary_causes_are_waited_for_and_named_at_the_timeout() -> None:
     assert "14.10 m" in late.mission.outcome
 
 
+def test_who_has_waited_long_for_a_late_host_has_all_the_time_to_the_start() -> None:
+    """It took off, and gave up in the air because it had waited on the ground; then so did all others."""
+    flight = Flight(start_timeout_s=20.0)
+    flight.peer(Phase.CONNECT)
+    flight.run(19.0)
+    flight.peer(Phase.STANDBY)
+    flight.until(Phase.TAKEOFF)
+    flight.run(15.0)
+    assert (flight.at, flight.mission.outcome) == ("TAKEOFF", "")
+    flight.run(6.0)
+    assert flight.mission.outcome == "not tracking after 20 s (TAKEOFF)"
+
+
 @pytest.mark.parametrize("slow", ["own", "peer", ""])
 def test_nobody_takes_off_while_a_processor_has_yet_to_show_that_it_keeps_up(slow: str) -> None:
     """Half a swarm in the air would wait there for the other half."""
