@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -36,9 +36,9 @@ PLACE = np.array([3.0, 0.0, -2.0])  # of the peer
 
 
 class Bench:
-    """One agent, and a peer that is only its messages."""
+    """One agent, and a peer that is only its messages; others of which nothing is heard may belong to the swarm."""
 
-    def __init__(self, far_hz: float = 0.0) -> None:
+    def __init__(self, far_hz: float = 0.0, peers: Sequence[int] = (1,)) -> None:
         self.clock, self.told = SimClock(), list[tuple[str, dict[str, Any]]]()
         hub = LocalHub(self.clock.now_us, 1)
         self.bus = hub.connect(agent_name(0))
@@ -48,12 +48,12 @@ class Bench:
         separation, vehicle = SeparationParams(), VehicleModelParams()
         params = CommitParams().for_vehicle(vehicle)
         self.world_model = WorldModel(
-            0, [1], separation, self.bus, rate_hz=RATE_HZ, note=lambda *_, **__: None, vouchers={}
+            0, [*peers], separation, self.bus, rate_hz=RATE_HZ, note=lambda *_, **__: None, vouchers={}
         )
         self.coordination = Coordination(
             agent=0,
             boot_id=1,
-            peers=[1],
+            peers=[*peers],
             params=params,
             planner=TrajectoryPlanner(
                 0, params, MpcParams(), vehicle, separation, max_keep_outs=2, stopwatch_ns=lambda: 0
@@ -64,7 +64,7 @@ class Bench:
             note=lambda name, **fields: self.told.append((name, fields)),
             rate_hz=RATE_HZ,
             far_peers=FarPeers(
-                [1],
+                peers,
                 speed_m_s=SPEED_M_S if far_hz else 0.0,
                 stretch_m=STRETCH_M,
                 apart_m=1.0,

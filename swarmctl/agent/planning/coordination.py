@@ -142,7 +142,8 @@ class Coordination:
         self._ended = self._world_model.ended
         suspected = self._suspected(utc_us)
         told = {agent: message.exclusions for agent, message in peers.newest.items()}
-        membership.update(suspected, told, self._ended, votes=peers.heard_before_flight == self._peers)
+        came = self._peers - self._world_model.excused  # before the flight; who is started again knows of nobody so
+        membership.update(suspected, told, self._ended, votes=peers.heard_before_flight >= came)
         said = (membership.exclusions.suspected, membership.exclusions.promised, membership.excluded)
         if said != self._membership_said:
             self._membership_said = said

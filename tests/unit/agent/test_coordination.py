@@ -69,6 +69,18 @@ def test_of_two_that_do_not_hear_each_other_none_excludes_the_other_and_both_lan
     assert ("membership", {"suspected": [], "promised": [], "excluded": []}) in bench.told
 
 
+@pytest.mark.parametrize("excludes", [True, False])
+def test_who_never_came_and_is_excluded_takes_nobodys_vote_away(excludes: bool) -> None:
+    """None of the others suspected anybody: of a host that was lost they were cut off, and landed."""
+    bench = Bench(peers=(1, 2))
+    if excludes:
+        bench.world_model.exclude(2)
+    bench.fly(1.0, each=bench.send)
+    bench.fly(6.0)
+    suspects = ("membership", {"suspected": [1], "promised": [], "excluded": []}) in bench.told
+    assert suspects is excludes, "who may have been started again amid the flight makes no promises"
+
+
 def test_an_excluded_agent_lands_where_it_is(bench: Bench) -> None:
     bench.fly(1.0, each=bench.send)
     bench.exclusions = Exclusions(promised=frozenset({0}))
