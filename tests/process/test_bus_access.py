@@ -9,16 +9,19 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
 from swarmctl.bus.bus import Bus
+from swarmctl.bus.network.datagram_links import bind_datagrams, datagram_address
+from swarmctl.bus.network.datagram_routes import DatagramRoutes
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identities import add_identity, make_identities, revoke_identity
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
+from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.bus.network.router import run_router
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.topics import COMMAND, ENDED, EVENT, MISSION, OBSTACLES, PATH, STATUS, Topic
@@ -155,6 +158,25 @@ def test_a_router_whose_port_for_datagrams_is_taken_says_which(swarm: SwarmOfHos
         links = links_of(swarm.hosts, swarm.identity("alpha"))
         with pytest.raises(StartError, match=rf"127\.0\.0\.1 port {port}: .*in use.*port after that of the host"):
             run_router(f"{SCHEME}{tempfile.mkdtemp(prefix='sw')}/bus.sock", links)
+
+
+def test_a_router_says_whom_it_hears_while_it_hears_much(swarm: SwarmOfHosts) -> None:
+    """One that has nothing else to say, as a station's, said so every 256 datagrams: others did not relay to it."""
+    identity = swarm.identity("bravo")
+    addresses = {host.name: datagram_address(host.address) for host in swarm.hosts}
+    bravo = DatagramRoutes(identity.roster, "bravo", load_keyring(identity).keys, addresses, session=1)
+    heard_s = list[float]()
+    with swarm.router("alpha"), closing(bind_datagrams(identity)) as sock:
+        sock.settimeout(0.004)
+        begun_s = time.monotonic()
+        while (now_s := time.monotonic()) < begun_s + 3.0:
+            for datagram, address in (*bravo.beat(now_s), *bravo.send("run/agent-1/path", b"path", now_s)):
+                sock.sendto(datagram, address)
+            with suppress(OSError):
+                datagram, _ = sock.recvfrom(65_536)
+                bravo.take(datagram, addresses["alpha"], time.monotonic())
+                heard_s.append(time.monotonic())
+    assert len([at_s for at_s in heard_s if at_s > begun_s + 1.0]) >= 10, "ten times a second, answers not counted"
 
 
 def test_a_revoked_identity_has_a_link_and_no_rights(

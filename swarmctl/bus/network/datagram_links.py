@@ -31,7 +31,6 @@ from swarmctl.errors import StartError
 _PREFIX = "swarm/"
 _WAKE_S = 0.02
 _BUFFER_BYTES = 1 << 20
-_MOST_AT_ONCE = 256  # datagrams that are taken between two beats
 _TOLD_EVERY_S = 10.0
 _MOST_PUBLISHERS = 1024
 _MOST_WAITING = 256  # messages of one topic that wait to be sent; the oldest gives way
@@ -126,17 +125,16 @@ class DatagramLinks:
             self._receive()
 
     def _receive(self) -> None:
-        """Deliver what comes until nothing has come for a moment."""
-        for _ in range(_MOST_AT_ONCE):
-            try:
-                datagram, source = self._socket.recvfrom(_BUFFER_BYTES)
-            except OSError:  # nothing has come, or a former datagram did not arrive
-                return
-            with self._lock:
-                taken = self._routes.take(datagram, (source[0], source[1]), time.monotonic())
-            self._send_all(taken.outgoing)
-            for key, payload in taken.messages:
-                self._publish(_PREFIX + key, payload)
+        """Deliver what comes next; wait for it for a moment."""
+        try:
+            datagram, source = self._socket.recvfrom(_BUFFER_BYTES)
+        except OSError:  # nothing has come, or a former datagram did not arrive
+            return
+        with self._lock:
+            taken = self._routes.take(datagram, (source[0], source[1]), time.monotonic())
+        self._send_all(taken.outgoing)
+        for key, payload in taken.messages:
+            self._publish(_PREFIX + key, payload)
 
     def _publish(self, key: str, payload: bytes) -> None:
         publisher = self._publishers.get(key)
