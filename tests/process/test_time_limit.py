@@ -38,3 +38,13 @@ def test_who_waits_for_others_or_is_held_before_the_mission_may_wait(
     services.phase = phase
     result = services.fly("mission.duration_s=1")
     assert (result.outcome, result.problems) == ("completed", [])
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_an_operators_hold_has_no_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held: bool) -> None:
+    """After five minutes beyond the mission one was landed, and the flight had failed."""
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_BEYOND_MISSION_S", 1.0)
+    services = ScriptedServices(tmp_path, [ends(0, 4.0)])
+    services.held, services.ends_s = held, time.monotonic()
+    result = services.fly("mission.duration_s=1")
+    assert result.outcome == ("completed" if held else "failed")

@@ -42,7 +42,7 @@ _STEP_S = 0.05
 _FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
 _VEHICLE_S = 90.0  # timeout for every agent to receive its vehicle
 _BEYOND_MISSION_S = 300.0  # for take-off, waiting and landing; a longer flight is ended
-_TIMED = (Phase.TRACK, Phase.GOTO_LAND)  # phases whose end is known; agents give up waiting before by themselves
+_TIMED = (Phase.TRACK, Phase.GOTO_LAND)  # phases whose end is known
 _SILENCE_S = 5.0
 _STANDSTILL_S = 5.0  # of a silent agent, after which it is ended
 _LAND_S = 60.0  # for agents to land that are told to; later they are killed
@@ -174,8 +174,9 @@ class FlightSupervisor:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
             view.status, view.received_s = status, time.monotonic()
             self._hearing.hear(view.agent)
-            if status.phase < Phase.TRACK or status.phase in _TIMED:  # it waits, or a mission or way back has its time
-                left_s = status.ends_in_s if status.phase in _TIMED else self._config.mission.duration_s
+            waits = status.held or status.phase < Phase.TRACK  # for as long as agents or operators want
+            if waits or status.phase in _TIMED:  # a mission, also one that an operator has set, or a long way back
+                left_s = self._config.mission.duration_s if waits else status.ends_in_s
                 self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + left_s)
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         adopted = self._obstacles.receive()
