@@ -43,7 +43,7 @@ from swarmctl.signing_keys import read_keys
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, ticks_file
 
-_TAIL_S = 120.0  # time allowed before and after the mission
+_TAIL_S = 120.0  # time allowed before and after the mission, and beyond what ends by itself
 _TRUTH_EVERY_US = 20_000
 _OBSTACLES_EVERY_US = 1_000_000
 
@@ -261,10 +261,21 @@ class Lockstep:
     def run(self, on_step: Callable[[Lockstep], bool | None] | None = None) -> None:
         """Fly until every agent has landed, the time limit is reached, or `on_step` returns True."""
         limit_us = round((self.config.mission.duration_s + _TAIL_S) * 1e6)
-        while not self.finished and self.clock.now_us() < limit_us:
+        while not self.finished:
+            if self.clock.now_us() >= limit_us:
+                left_s = self._ends_in_s()
+                if not left_s:
+                    return
+                limit_us = self.clock.now_us() + round((left_s + _TAIL_S) * 1e6)
             self.step()
             if on_step is not None and on_step(self):
                 return
+
+    def _ends_in_s(self) -> float:
+        """Return until when agents do what ends by itself, such as a long way back; 0 where nobody does."""
+        left_s = [agent.ends_in_s for agent in self.agents if agent is not None]
+        return max((seconds for seconds in left_s if seconds > 0.0), default=0.0)
+
 
 
 def _hub(config: Config, clock: SimClock) -> LocalHub:

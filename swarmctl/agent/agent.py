@@ -137,6 +137,11 @@ class Agent:
         return self._mission.outcome or "stopped before the mission began"
 
     @property
+    def ends_in_s(self) -> float:
+        """Time until what it does ends by itself, the way back too [s]; NaN where it does not, as in a hold."""
+        return self._mission.ends_in_s(self._ports.clock.now_us(), self._ports.clock.utc_us())
+
+    @property
     def has_armed(self) -> bool:
         """Whether arming has been requested; a mission that ends before that counts as one that could not start."""
         return self._mission.arming.requested
