@@ -46,6 +46,7 @@ from swarmctl.telemetry.recording.file_names import events_file, frames_file, pl
 _TAIL_S = 120.0  # time allowed before and after the mission, and beyond what ends by itself
 _TRUTH_EVERY_US = 20_000
 _OBSTACLES_EVERY_US = 1_000_000
+_WHOLE = 1e-6  # by which a number of steps may differ from a whole one
 
 
 @dataclass(kw_only=True)
@@ -127,11 +128,8 @@ class Lockstep:
         agents = config.swarm.agents
         self.config = config
         self.clock = SimClock()
-        self._tick_us = round(1e6 / config.agent.rate_hz)
         self._physics_us = round(1e6 / config.sitl.physics_hz)
-        if self._tick_us % self._physics_us:
-            told = f"sitl.physics_hz = {config.sitl.physics_hz:g}: in lockstep a multiple of agent.rate_hz"
-            raise ConfigError(config.name, [f"{told} = {config.agent.rate_hz:g}; set one to suit the other"])
+        self._tick_us = self._physics_us * _steps_per_tick(config)
         latency_us = round(config.sitl.link_latency_ms * 1000)
         self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]  # (agent's, vehicle's) ends
         self._keys = read_keys(config.mavlink.signing_keys, agents)
@@ -184,7 +182,7 @@ class Lockstep:
     def step(self) -> None:
         """Tick every agent once, then step the physics to the next tick."""
         now_us = self.clock.now_us()
-        if now_us % _OBSTACLES_EVERY_US == 0:
+        if _is_due(now_us, self._tick_us, _OBSTACLES_EVERY_US):
             self._operator.publish(topics.OBSTACLES, encode_message(self._obstacles))
         for i in self._order:
             agent = self.agents[i]
@@ -198,8 +196,8 @@ class Lockstep:
         for _ in range(self._tick_us // self._physics_us):
             self.clock.advance(self._physics_us)
             self.world.step(self.clock.now_us())
-        if self.clock.now_us() % _TRUTH_EVERY_US == 0:
-            self._truth.append(self.world.truth_rows())
+            if _is_due(self.clock.now_us(), self._physics_us, _TRUTH_EVERY_US):
+                self._truth.append(self.world.truth_rows())
 
     def kill(self, index: int) -> None:
         """End an agent's process: no more setpoints, its bus session closes, and the others are told as by a launch."""
@@ -276,6 +274,24 @@ class Lockstep:
         left_s = [agent.ends_in_s for agent in self.agents if agent is not None]
         return max((seconds for seconds in left_s if seconds > 0.0), default=0.0)
 
+
+def _steps_per_tick(config: Config) -> int:
+    """Return how many steps of the physics a tick of the agents has.
+
+    Raises:
+        ConfigError: it has no whole number of them.
+    """
+    physics_hz, rate_hz = config.sitl.physics_hz, config.agent.rate_hz
+    steps = round(physics_hz / rate_hz)
+    if abs(physics_hz / rate_hz - steps) > _WHOLE:
+        told = f"sitl.physics_hz = {physics_hz:g}: in lockstep a multiple of agent.rate_hz"
+        raise ConfigError(config.name, [f"{told} = {rate_hz:g}; set one to suit the other"])
+    return steps
+
+
+def _is_due(now_us: int, step_us: int, every_us: int) -> bool:
+    """Return whether this step, `step_us` after the one before, is the first at or after a multiple of `every_us`."""
+    return now_us // every_us > (now_us - step_us) // every_us
 
 
 def _hub(config: Config, clock: SimClock) -> LocalHub:
