@@ -6,7 +6,7 @@ The kinds that a configuration can choose from are the modules of `kinds/`, each
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -18,10 +18,12 @@ from swarmctl.control.reference.polynomial import through
 from swarmctl.core.discovery.declared import modules_of
 from swarmctl.core.discovery.own import BuiltInOrOwn, OwnError, in_words, own_class
 from swarmctl.core.params import Params, with_sections
+from swarmctl.core.text import printable
 from swarmctl.core.types import Array, Sampled
 
 GROUP = "swarmctl.missions"  # of entry points
 _ROW_S, _MAX_ROWS = 0.02, 100_000  # of the table that an own mission becomes
+_MAX_SHOWN = 120  # characters of what an own mission says
 _DIFFERENCE_S = 1e-3  # half the step of the difference of velocities that acceleration is
 
 _MODULES = tuple(modules_of(kinds))  # importing a module makes its kinds known
@@ -85,33 +87,77 @@ class MissionParams(Params):
 
     def problems(self, agents: int) -> Iterator[str]:
         """Yield problems that involve several keys."""
-        return self.flown().problems(agents)
+        if not self.is_own:
+            yield from self.flown().problems(agents)
+            return
+        try:
+            yield from [str(problem) for problem in self.flown().problems(agents)]
+        except (Exception, SystemExit) as error:  # whatever it does
+            yield f"mission.kind = {self.kind!r}: its problems raised {in_words(error)}"
 
     def references(self, starts_ned_m: Array, apart_m: float) -> list[MissionReference]:
         """Return the reference of every agent; see `MissionReference`."""
         return [MissionReference(self, starts_ned_m, agent, apart_m) for agent in range(len(starts_ned_m))]
 
 
-def _tabulated(mission: MissionKind, place: Place, params: MissionParams) -> tuple[Sampled, Heading | None, Array]:
-    """Return position and velocity, yaw and offset of an own mission, read off a table that is made now.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Flown:
+    """Holds what a mission asks of one agent."""
 
-    What is checked before a flight is thereby what is flown, and code of somebody else never runs in a tick.
+    sampled: Sampled
+    heading: Heading | None
+    offset_ned_m: Array  # (3,)
+    jumps: bool
+    fixed_in_time: bool
+
+
+def _flown(mission: MissionKind, place: Place) -> _Flown:
+    return _Flown(
+        sampled=mission.reference(place),
+        heading=mission.heading(place),
+        offset_ned_m=mission.offset_ned_m(place),
+        jumps=mission.jumps,
+        fixed_in_time=mission.fixed_in_time,
+    )
+
+
+def _tabulated(mission: MissionKind, place: Place, params: MissionParams) -> _Flown:
+    """Return what an own mission asks of an agent, read off a table that is made now.
+
+    What is checked before a flight is thereby what is flown, and code of somebody else never makes a reference in a
+    tick.
 
     Raises:
         OwnError: it raises, or returns something else than positions and velocities.
     """
     t_s = np.linspace(0.0, params.duration_s, min(_MAX_ROWS, max(3, round(params.duration_s / _ROW_S) + 1)))
     try:
-        pos, vel = (np.asarray(values, dtype=np.float64) for values in mission.reference(place)(t_s.copy()))
-        heading, offset = mission.heading(place), np.asarray(mission.offset_ned_m(place), dtype=np.float64)
-        yaw = np.zeros(len(t_s)) if heading is None else np.asarray(heading(t_s.copy()), dtype=np.float64)
+        asked = _flown(mission, place)
+        pos, vel = (np.asarray(values, dtype=np.float64) for values in asked.sampled(t_s.copy()))
+        offset = np.asarray(asked.offset_ned_m, dtype=np.float64)
+        yaw = np.zeros(len(t_s)) if asked.heading is None else np.asarray(asked.heading(t_s.copy()), dtype=np.float64)
     except (Exception, SystemExit) as error:  # whatever it does
         raise OwnError(f"{params.kind} raised {in_words(error)}") from error
-    if pos.shape != (len(t_s), 3) or vel.shape != pos.shape or yaw.shape != t_s.shape or offset.shape != (3,):
-        shapes = f"{pos.shape} and {vel.shape}"
-        raise OwnError(f"{params.kind} returned positions and velocities of shape {shapes} for {len(t_s)} times")
-    turning = None if heading is None else lambda at_s: np.interp(at_s, t_s, np.unwrap(yaw))
-    return through(t_s, pos, vel, None).sample, turning, offset
+    for name, values, wanted in (
+        ("positions", pos, (len(t_s), 3)),
+        ("velocities", vel, (len(t_s), 3)),
+        ("yaws", yaw, t_s.shape),
+        ("an offset", offset, (3,)),
+    ):
+        if values.shape != wanted:
+            times = f" for {len(t_s)} times" if len(t_s) in wanted else ""
+            raise OwnError(f"{params.kind} returned {name} of shape {values.shape}{times}, not {wanted}")
+    unwrapped = np.unwrap(yaw)
+    turning = None if asked.heading is None else lambda at_s: np.interp(at_s, t_s, unwrapped)
+    sampled = through(t_s, pos, vel, None).sample
+    return replace(
+        asked,
+        sampled=sampled,
+        heading=turning,
+        offset_ned_m=offset,
+        jumps=bool(asked.jumps),
+        fixed_in_time=bool(asked.fixed_in_time),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,28 +181,19 @@ class MissionReference:
 
     Attributes:
         offset_ned_m: own place (3,) around a reference that several share; the error of tracking is that to the latter.
+        jumps: positions are steps, which no vehicle follows.
+        fixed_in_time: every agent is meant to be where its reference is.
         goal: where the agent is meant to arrive; None of a mission that is flown for its way, or somebody else's.
     """
 
     def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int, apart_m: float = 0.0) -> None:
         self._mission, self._start_ned_m, self._yaw_rad = params.flown(), starts_ned_m[agent], params.yaw_rad
+        self._own_name = params.kind if params.is_own else ""
         place = Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m)
         self.goal = None if params.is_own else self._mission.goal(place)
-        if params.is_own:
-            self._sampled, self._heading, self.offset_ned_m = _tabulated(self._mission, place, params)
-        else:
-            self._sampled, self._heading = self._mission.reference(place), self._mission.heading(place)
-            self.offset_ned_m = self._mission.offset_ned_m(place)
-
-    @property
-    def jumps(self) -> bool:
-        """Return whether positions are steps, which no vehicle follows."""
-        return self._mission.jumps
-
-    @property
-    def fixed_in_time(self) -> bool:
-        """Return whether every agent is meant to be where its reference is."""
-        return self._mission.fixed_in_time
+        asked = _tabulated(self._mission, place, params) if params.is_own else _flown(self._mission, place)
+        self._sampled, self._heading, self.offset_ned_m = asked.sampled, asked.heading, asked.offset_ned_m
+        self.jumps, self.fixed_in_time = asked.jumps, asked.fixed_in_time
 
     def sample(self, t_s: Array) -> tuple[Array, Array]:
         """Return positions and velocities, (K, 3) NED each, at mission times `t_s` (K,); at rest before 0."""
@@ -184,4 +221,10 @@ class MissionReference:
 
     def excess(self, pos_ned_m: Array, vel_ned_m_s: Array) -> str:
         """Say why the flight must end at this position and velocity (3,) NED, or ""."""
-        return self._mission.excess(self._start_ned_m, pos_ned_m, vel_ned_m_s)
+        if not self._own_name:
+            return self._mission.excess(self._start_ned_m, pos_ned_m, vel_ned_m_s)
+        try:
+            told = self._mission.excess(self._start_ned_m.copy(), pos_ned_m.copy(), vel_ned_m_s.copy())
+            return printable(str(told), _MAX_SHOWN) if told else ""
+        except (Exception, SystemExit) as error:  # whatever it does: the vehicle is landed
+            return printable(f"mission {self._own_name} raised {in_words(error)}", _MAX_SHOWN)

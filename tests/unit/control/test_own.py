@@ -225,6 +225,58 @@ def test_an_own_mission_is_checked_before_it_is_flown(
         assert load(tmp_path / "own.toml").mission.is_own
 
 
+HOOKS = """
+import numpy as np
+from swarmctl.control.reference.kind import MissionKind
+
+class Own(MissionKind):
+    def reference(self, place):
+        return lambda t: (np.tile(place.start_ned_m, (len(t), 1)), np.zeros((len(t), 3)))
+
+    {hook}
+"""
+
+
+def written(folder: Path, hook: str) -> Path:
+    name = f"hook_{abs(hash(hook))}"
+    (folder / f"{name}.py").write_text(HOOKS.format(hook=hook))
+    (folder / "own.toml").write_text(f'[mission]\nkind = "{name}:Own"\nduration_s = 3.0\n')
+    return folder / "own.toml"
+
+
+@pytest.mark.parametrize(
+    ("hook", "words"),
+    [
+        ("def problems(self, agents): yield 'too many'", "too many"),
+        ("def problems(self, agents): return {}[agents]", "its problems raised KeyError"),
+        ("def problems(self, agents): pass", "its problems raised TypeError"),
+        ("fixed_in_time = property(lambda self: 1 / 0)", "raised ZeroDivisionError"),
+        ("def heading(self, place): return lambda t: np.zeros((len(t), 1))", "yaws of shape (151, 1) for 151 times"),
+        ("def heading(self, place): return 0.5", "raised TypeError"),
+        ("def offset_ned_m(self, place): return np.zeros(2)", "an offset of shape (2,), not (3,)"),
+    ],
+)
+def test_what_else_an_own_mission_says_is_checked_too(hook: str, words: str, tmp_path: Path) -> None:
+    assert words in refusal(path=written(tmp_path, hook))
+
+
+@pytest.mark.parametrize(
+    ("hook", "said"),
+    [
+        ("def excess(self, start, pos, vel): return 'too far'", "too far"),
+        ("def excess(self, start, pos, vel): return None", ""),
+        ("def excess(self, start, pos, vel): return 1 / 0", "mission hook_{} raised ZeroDivisionError"),
+        ("def excess(self, start, pos, vel):\n        pos -= 100.0\n        return ''", ""),
+    ],
+)
+def test_what_an_own_mission_does_in_a_tick_ends_the_flight_at_most(hook: str, said: str, tmp_path: Path) -> None:
+    config = load(written(tmp_path, hook))
+    reference = config.mission.references(np.array(config.starts_ned_m()), 1.0)[0]
+    here = HERE.copy()
+    assert reference.excess(here, np.zeros(3)).startswith(said.format(f"{abs(hash(hook))}:Own"))
+    np.testing.assert_array_equal(here, HERE)
+
+
 def test_installed_packages_offer_missions_and_controllers(monkeypatch: pytest.MonkeyPatch) -> None:
     def offered(group: str) -> list[importlib.metadata.EntryPoint]:
         return [importlib.metadata.EntryPoint("scripted", f"{__name__}:Scripted", group)]
