@@ -59,8 +59,7 @@ class ControllerParams(Params):
         Raises:
             OwnError: there is no such controller.
         """
-        found: type[Params] = own_class(self.kind, GROUP, OwnController).Params
-        return found
+        return _params_of(own_class(self.kind, GROUP, OwnController), self.kind)
 
 
 def make_controller(params: ControllerParams, setup: ControllerSetup) -> Controller:
@@ -79,11 +78,23 @@ def make_own(params: ControllerParams, setup: ControllerSetup, grid: Controller)
         ValidationError: its parameters are wrong.
     """
     found: type[OwnController] = own_class(params.kind, GROUP, OwnController)
-    own_params = found.Params.model_validate(params.own)
+    own_params = _params_of(found, params.kind).model_validate(params.own)
     try:
         return found(own_params, setup, grid.dt_us * 1e-6, grid.steps)
     except (Exception, SystemExit) as error:  # whatever it does when it is made
         raise OwnError(f"{params.kind} can't be made: {in_words(error)}") from error
+
+
+def _params_of(controller: type[OwnController], name: str) -> type[Params]:
+    """Return the class of an own controller's parameters.
+
+    Raises:
+        OwnError: it is none of parameters.
+    """
+    found: object = controller.Params
+    if not isinstance(found, type) or not issubclass(found, Params):
+        raise OwnError(f"{name}: its Params is no class derived from {Params.__module__}.{Params.__name__}")
+    return found
 
 
 def _built_in(name: str, params: ControllerParams, setup: ControllerSetup) -> Controller:

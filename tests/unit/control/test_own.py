@@ -277,6 +277,34 @@ def test_what_an_own_mission_does_in_a_tick_ends_the_flight_at_most(hook: str, s
     np.testing.assert_array_equal(here, HERE)
 
 
+CONTROLLER = """
+from swarmctl.control.controllers.own import FeedbackController
+from swarmctl.core.params import Params
+
+class Gains(Params):
+    {gains}
+
+class Own(FeedbackController):
+    Params = Gains
+
+    def accel_ned_m_s2(self, pos, vel, wanted_pos, wanted_vel, wanted_accel):
+        return wanted_accel
+"""
+
+
+def configured(folder: Path, gains: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / "own_gains.py").write_text(CONTROLLER.format(gains=gains))
+    (folder / "own.toml").write_text('[controller]\nkind = "own_gains:Own"\n')
+    return folder / "own.toml"
+
+
+def test_parameters_of_an_own_controller_that_are_none_are_refused(tmp_path: Path) -> None:
+    path = configured(tmp_path, "kp: float = 1.0")
+    (tmp_path / "own_gains.py").write_text(CONTROLLER.format(gains="kp: float = 1.0").replace("(Params)", ""))
+    assert "own_gains:Own: its Params is no class derived from swarmctl.core.params.Params" in refusal(path=path)
+
+
 def test_installed_packages_offer_missions_and_controllers(monkeypatch: pytest.MonkeyPatch) -> None:
     def offered(group: str) -> list[importlib.metadata.EntryPoint]:
         return [importlib.metadata.EntryPoint("scripted", f"{__name__}:Scripted", group)]
