@@ -156,5 +156,6 @@ class Planner:
                 disturbance_ned_m_s2=self._own_state.estimate.disturbance_ned_m_s2,
                 keep_outs=directive.keep_outs,
                 guess_ned_m=self._modes.guess_ned_m(start.t_us),
+                ground_z_m=self._mission.ground_z_m,
             )
         )

@@ -1,10 +1,10 @@
 """What stands between a controller of somebody else and the vehicle; it can't be switched off.
 
 In every tick the own controller is asked for commands. They are flown only if they are finite, if the motion that they
-give the vehicle by its model, which is computed here, keeps clear of every keep-out and stays in the flight volume, and
-if the vehicle can stop behind it. Otherwise the built-in controller plans this tick, by its own certificate. A
-controller that raises, returns something else than commands, or takes too long, again and again, is not asked any more,
-and the mission ends.
+give the vehicle by its model, which is computed here, keeps clear of every keep-out, stays in the flight volume and
+above the ground, and if the vehicle can stop behind it. Otherwise the built-in controller plans this tick, by its own
+certificate. A controller that raises, returns something else than commands, or takes too long, again and again, is not
+asked any more, and the mission ends.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes, Reference
 LATE_S = 0.05  # more than two ticks: setpoints have gaps
 LATE_IN_A_ROW = 3  # late plans after which a controller is not asked any more
 BAD_IN_A_ROW = 25  # likewise, without commands: half a second
+_GROUND_M = 0.3  # least height of a plan above the place of the take-off, as of references
+_BELOW_M = 0.1  # by which a plan may be lower than a reference that leads there
 _TAIL_POINTS = 30  # of the braking behind a plan
 _MAX_SHOWN = 120  # characters of an exception
 _MOST_TRACED = 8  # places whose traceback is told: a controller may raise in every tick
@@ -89,7 +91,21 @@ class Guard:
             return self._instead(problem, "plans too close to a peer or an obstacle")
         if volume_margin_m(self._setup.volume, plan.pos_ned_m, plan.vel_ned_m_s, 1) < 0.0:
             return self._instead(problem, "plans to leave the flight volume")
+        if self._sinks_too_low(plan, problem):
+            return self._instead(problem, "plans to fly into the ground")
         return plan
+
+    def _sinks_too_low(self, plan: Plan, problem: Problem) -> bool:
+        """Return whether a plan, or a stop behind it, comes too near to the height of the take-off.
+
+        A reference may lead lower, down a slope: so may a plan that follows it.
+        """
+        if problem.ground_z_m is None:
+            return False
+        lowest_z_m = max(problem.ground_z_m - _GROUND_M, float(problem.reference.pos_ned_m[:, 2].max()) + _BELOW_M)
+        sinks_m_s = max(0.0, float(plan.vel_ned_m_s[-1, 2]))
+        stops_z_m = float(plan.pos_ned_m[-1, 2]) + sinks_m_s**2 / (2.0 * self._setup.separation.brake_m_s2)
+        return max(stops_z_m, float(plan.pos_ned_m[1:, 2].max())) > lowest_z_m
 
     def _called(self, call: Callable[[], Array | None]) -> tuple[Array, str]:
         """Return what a call of the own controller returns, and what it raised, or ""."""
@@ -189,4 +205,5 @@ def _copied(problem: Problem) -> Problem:
         disturbance_ned_m_s2=problem.disturbance_ned_m_s2.copy(),
         keep_outs=tuple(replace(keep_out, pos_ned_m=keep_out.pos_ned_m.copy()) for keep_out in problem.keep_outs),
         guess_ned_m=None if guess is None else guess.copy(),
+        ground_z_m=problem.ground_z_m,
     )

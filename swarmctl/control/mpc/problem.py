@@ -37,3 +37,4 @@ class Problem:
     disturbance_ned_m_s2: Array  # (3,) constant over the horizon
     keep_outs: tuple[KeepOut, ...]  # peers and obstacles, aligned with the plan's times
     guess_ned_m: Array | None  # (steps+1, 3) own previous prediction at the new times; None for constant velocity
+    ground_z_m: float | None = None  # down coordinate of the place of the take-off; None where it is not known

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import itertools
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +136,27 @@ def test_a_vehicle_must_be_able_to_stop_behind_its_plan() -> None:
     plan = controller.plan(hover(controller, (1.75, 0.0, 0.0)))
     assert "plans too close" in plan.failure
     assert controller.plan(hover(controller, (4.0, 0.0, 0.0))).failure == ""
+
+
+def falling(own: OwnController, problem: Problem) -> Array:
+    return np.tile([0.0, 0.0, 0.0], (own.steps, 1))
+
+
+@pytest.mark.parametrize("above_m", [None, 100.0, 2.0])
+def test_a_plan_into_the_ground_is_replaced(above_m: float | None) -> None:
+    """One that asked for no thrust fell from 2 m to the ground: its agent crashed at 0.7 s."""
+    controller = guarded(falling)
+    problem = replace(hover(controller), ground_z_m=None if above_m is None else HERE[2] + above_m)
+    assert ("plans to fly into the ground" in controller.plan(problem).failure) == (above_m == 2.0)
+
+
+def test_a_plan_that_follows_its_reference_below_the_place_of_the_take_off_is_flown() -> None:
+    controller = guarded(level)
+    here = hover(controller)
+    assert controller.plan(replace(here, ground_z_m=HERE[2] - 5.0)).failure == "", "down a slope"
+    above = replace(here.reference, pos_ned_m=here.reference.pos_ned_m - [0.0, 0.0, 5.0])
+    low = replace(here, reference=above, ground_z_m=HERE[2] + 0.1)
+    assert "plans to fly into the ground" in controller.plan(low).failure
 
 
 def test_what_it_is_told_can_be_changed_without_effect() -> None:
