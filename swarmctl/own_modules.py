@@ -7,6 +7,8 @@ of a launch find the same modules.
 
 from __future__ import annotations
 
+import importlib
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -25,6 +27,11 @@ from swarmctl.core.discovery.own import OwnError
 from swarmctl.core.params import Params
 
 OWN_FOLDER = "own_folder"  # key of a configuration
+OWN_KINDS = ("mission.kind", "controller.kind")  # keys that may name own ones
+_SHIPPED = [Path(__file__).resolve().parents[1] / package for package in ("swarmctl", "sitl")]
+_INSTALLED = "site-packages"  # folder of what is installed
+_added: list[str] = []  # folders of own modules in `sys.path`, the one asked for last first
+_imported_ns: dict[str, int] = {}  # when files of own modules had been changed, as they were imported
 
 
 def locate(tree: dict[str, Any], folder: Path) -> None:
@@ -41,9 +48,54 @@ def locate(tree: dict[str, Any], folder: Path) -> None:
 
 
 def make_importable(folder: str) -> None:
-    """Let this process import from a folder; "" for none."""
-    if folder and folder not in sys.path:
-        sys.path.append(folder)
+    """Let this process import from a folder; "" for none.
+
+    Modules of the same names in the folder of another configuration, and those whose files have changed since they were
+    imported, are imported anew: what is checked in a notebook is then what a flight, a process of its own, imports.
+    """
+    if not folder:
+        return
+    if folder in _added or folder not in sys.path:
+        sys.path[:] = [place for place in sys.path if place not in _added]
+        _added[:] = [folder, *(added for added in _added if added != folder)]
+        sys.path.extend(_added)  # behind all that is installed
+    importlib.invalidate_caches()  # a file may have been written just now
+    known = list(_own_files(folder, *_added))
+    if any(_is_hidden(name, file, folder) or _has_changed(file) for name, file in known):
+        for name, file in known:  # they may import each other
+            _imported_ns.pop(str(file), None)
+            del sys.modules[name]
+
+
+def own_sources(folder: str) -> list[Path]:
+    """Return the files in the folder of own modules that this process has imported; "" for none."""
+    return sorted({file for _, file in _own_files(folder)}) if folder else []
+
+
+def _own_files(*folders: str) -> Iterator[tuple[str, Path]]:
+    """Yield name and file of each module imported from folders, but for those that are installed there, or shipped."""
+    inside, elsewhere = (tuple(f"{folder}{os.sep}" for folder in listed) for listed in (folders, _SHIPPED))
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if not isinstance(file, str) or not file.endswith(".py") or name == "__main__":
+            continue
+        if file.startswith(inside) and not file.startswith(elsewhere) and _INSTALLED not in file:
+            yield name, Path(file)
+
+
+def _is_hidden(name: str, file: Path, folder: str) -> bool:
+    """Return whether a module is another folder's, and this one has one of that name."""
+    return not file.is_relative_to(folder) and Path(folder, *name.split(".")).with_suffix(".py").is_file()
+
+
+def _has_changed(file: Path) -> bool:
+    """Return whether the file of a module has changed since that was imported."""
+    return _imported_ns.get(str(file), _changed_ns(file)) != _changed_ns(file)
+
+
+def _changed_ns(file: Path) -> int:
+    """Return when a file was changed; 0 where it is gone."""
+    return file.stat().st_mtime_ns if file.is_file() else 0
 
 
 def own_problems(
@@ -62,6 +114,8 @@ def own_problems(
             return make_controller(controller, setup)
 
         yield from _problems("controller", controller.kind, make, controller.own_params)
+    for _, file in _own_files(*_added):
+        _imported_ns.setdefault(str(file), _changed_ns(file))
 
 
 def _problems(section: str, name: str, make: Callable[[], object], params: Callable[[], type[Params]]) -> Iterator[str]:

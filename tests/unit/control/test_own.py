@@ -322,6 +322,20 @@ def configured(folder: Path, gains: str) -> Path:
     return folder / "own.toml"
 
 
+def test_own_modules_that_have_changed_are_imported_anew(tmp_path: Path) -> None:
+    """A notebook was told `unknown key` of a parameter that it had just added, until its kernel was started again."""
+    path = configured(tmp_path / "a", "kp: float = 1.0")
+    assert load(path, ["controller.own.kp=2"])
+    assert "unknown key" in refusal("controller.own.kd=2", path=path)
+    before = sys.modules["own_gains"]
+    assert load(path) and sys.modules["own_gains"] is before, "it is the same as long as its file is"
+    configured(tmp_path / "a", "kp: float = 1.0; kd: float = 1.0")
+    assert load(path, ["controller.own.kd=2"])
+    other = configured(tmp_path / "b", "gain: float = 1.0")
+    assert load(other, ["controller.own.gain=2"]), "another folder has a module of the same name"
+    assert load(path, ["controller.own.kd=2"])
+
+
 def test_parameters_of_an_own_controller_that_are_none_are_refused(tmp_path: Path) -> None:
     path = configured(tmp_path, "kp: float = 1.0")
     (tmp_path / "own_gains.py").write_text(CONTROLLER.format(gains="kp: float = 1.0").replace("(Params)", ""))
