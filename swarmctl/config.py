@@ -31,6 +31,7 @@ from swarmctl.configuration.constraints import (
     simulated_host_problems,
     speed_problems,
     starts_apart,
+    tick_problems,
     vehicle_problems,
     volume_problems,
 )
@@ -334,6 +335,7 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
     yield from config.mission.kind_problems()
     yield from config.mission.problems(agents)
     yield from own_controller_problems(config.controller, separation, config.agent.barrier)
+    yield from tick_problems(config.controller, config.agent.rate_hz)
     yield from path_sharing_problems(config.agent.path_sharing, separation)
     drift_m = config.drift_m if agents > 1 else 0.0
     yield from separation_problems(separation, config.vehicle_model, config.limits, agents, drift_m)

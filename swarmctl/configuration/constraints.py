@@ -13,6 +13,7 @@ from swarmctl.configuration.sections import LimitParams, SitlParams, VehiclePara
 from swarmctl.control.collision.barrier import BarrierParams
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
 from swarmctl.control.controllers.discovery import ControllerParams
+from swarmctl.control.controllers.pid import PID, PidParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.reference.deadlock_params import DeadlockParams
@@ -24,6 +25,7 @@ from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.transport import Endpoint, parse_url
 
 _PAIRS_SHOWN = 3
+_SAME_TICK = 1e-3  # share by which a PID's time between two ticks may be off
 _HEARTBEATS = 4  # within the time after which a peer counts as silent: three may be missed in succession
 _LEAST_FAR_COMMITTED_HZ = 2.0  # a round trip, one message of it lost, lasts less than a lease
 _LEAST_FAR_HZ = 0.5  # two seconds, in which two vehicles may have come ten metres closer
@@ -40,6 +42,16 @@ def own_controller_problems(
             f"controller.kind = {controller.kind!r} with separation.mode = 'guaranteed': commitments are tracked"
             " by built-in controllers; set separation.mode = 'best_effort'"
         )
+
+
+def tick_problems(controller: ControllerParams, rate_hz: float) -> Iterator[str]:
+    """Yield that the PID would take ticks to be longer or shorter than they are."""
+    dt_s, tick_s = controller.section(PidParams).dt_s, 1.0 / rate_hz
+    if controller.kind == PID.name and abs(dt_s - tick_s) > _SAME_TICK * tick_s:
+        ticks = f"ticks are {tick_s:.4g} s apart by agent.rate_hz = {rate_hz:g}"
+        factor = f"a factor of {max(dt_s / tick_s, tick_s / dt_s):.2g}"
+        off = f"its derivative and its integral would be off by {factor}; set it to {tick_s:.6g}"
+        yield f"controller.pid.dt_s = {dt_s:g}: {ticks}: {off}"
 
 
 def path_sharing_problems(sharing: PathSharingParams, separation: SeparationParams) -> Iterator[str]:

@@ -342,6 +342,13 @@ def test_parameters_of_an_own_controller_that_are_none_are_refused(tmp_path: Pat
     assert "own_gains:Own: its Params is no class derived from swarmctl.core.params.Params" in refusal(path=path)
 
 
+def test_a_pid_that_would_take_ticks_for_longer_or_shorter_is_refused() -> None:
+    said = refusal("controller.kind=pid", "agent.rate_hz=25")
+    assert "controller.pid.dt_s = 0.02: ticks are 0.04 s apart by agent.rate_hz = 25" in said
+    assert load(None, ["controller.kind=pid", "agent.rate_hz=25", "controller.pid.dt_s=0.04"])
+    assert load(None, ["agent.rate_hz=25"])
+
+
 def test_installed_packages_offer_missions_and_controllers(monkeypatch: pytest.MonkeyPatch) -> None:
     def offered(group: str) -> list[importlib.metadata.EntryPoint]:
         return [importlib.metadata.EntryPoint("scripted", f"{__name__}:Scripted", group)]
