@@ -12,12 +12,16 @@ from swarmctl.config import Config
 from swarmctl.control.reference.kinds.csv_table import CsvParams
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.text import point_text
+from swarmctl.core.types import Array
 
 _BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
 _SHOWN = 3
 _SAMPLES = 2000  # of a mission
+_PLANNERS = ("mpc", "dmpc", "dmpc3")  # controllers that are bounded by u_max
+_BEHIND_M = 0.5  # by acceleration that is lacking: short peaks cost less
 _SAME_M = 1e-6  # distances that differ by less are the same but for rounding
 _STEEP_RAD = 0.75  # a real PX4 has yawed at 44 degrees, and had no thrust left at 55
+_SAME_TICK = 1e-3  # share by which two times between ticks may differ
 _ZERO = np.zeros(1)
 
 
@@ -27,9 +31,10 @@ def config_warnings(config: Config) -> list[str]:
     kind = config.mission.kind
     found = [f"mission.{name} is set, mission.kind is {kind!r}: it is not flown" for name in unused]
     references = config.mission.references(np.array(config.starts_ned_m()), config.separation.budget.planned_m)
-    flown = (*_begin_elsewhere(config, references), *_seen_too_late(config, references))
+    flown = (*_begin_elsewhere(config, references), *_left_behind(config, references))
+    flown = (*flown, *_seen_too_late(config, references))
     judged = (*_judged_by_more_than_is_kept(config), *_stand_above_each_other(config))
-    return [*found, *flown, *judged, *_turned_by_steep_tilt(config)]
+    return [*found, *flown, *judged, *_turned_by_steep_tilt(config), *_counts_by_other_ticks(config)]
 
 
 def warning_lines(config: Config) -> list[str]:
@@ -69,6 +74,32 @@ def _begin_elsewhere(config: Config, references: Sequence[MissionReference]) -> 
     added = config.mission.kind == "csv" and config.mission.section(CsvParams).from_start
     hint = "; mission.csv.from_start adds positions to the start: begin at 0, 0, 0" if added else ""
     yield from _first([f"{text}{hint}" for text in found], "references begin away from the agents' starts")
+
+
+def _left_behind(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
+    """Yield whose reference accelerates for longer than the controller may tilt for, although the vehicle could."""
+    mpc, t_s = config.controller.mpc, np.linspace(0.0, config.mission.duration_s, _SAMPLES)[:-1]  # then it may end
+    for agent, reference in enumerate(references):
+        model = config.model_of(agent)
+        if reference.jumps or config.controller.kind not in _PLANNERS or mpc.u_max >= model.u_max():
+            continue
+        motion, has_m_s2 = reference.motion(t_s), mpc.accel_max_m_s2(model)
+        needed_m_s2 = np.abs(motion.accel_ned_m_s2 + model.drag_1_s * motion.vel_ned_m_s)[:, :2]
+        if max(_falls_behind_m(t_s[1], axis - has_m_s2) for axis in needed_m_s2.T) > _BEHIND_M:
+            asks = f"agent {agent}: the reference asks for up to {needed_m_s2.max():.2f} m/s2 along an axis"
+            gives = f"controller.mpc.u_max = {mpc.u_max:g} gives {has_m_s2:.2f}: the vehicle is left behind"
+            yield f"{asks}, {gives}. Raise it, or make the mission slower or larger"
+            return
+
+
+def _falls_behind_m(step_s: float, lacking_m_s2: Array) -> float:
+    """Return how far a vehicle falls behind, at most, in one stretch of time in which it lacks acceleration (K,)."""
+    speed_m_s, behind_m, most_m = 0.0, 0.0, 0.0
+    for lacking in lacking_m_s2.tolist():
+        speed_m_s = speed_m_s + lacking * step_s if lacking > 0.0 else 0.0
+        behind_m = behind_m + speed_m_s * step_s if lacking > 0.0 else 0.0
+        most_m = max(most_m, behind_m)
+    return most_m
 
 
 def _first(found: Sequence[str], others: str) -> Iterator[str]:
@@ -124,3 +155,11 @@ def _turned_by_steep_tilt(config: Config) -> Iterator[str]:
     if config.vehicles and model.heading == "euler" and model.tilt_max_rad > _STEEP_RAD:
         steep = f"vehicle_model.heading = 'euler' with tilt_max_rad = {model.tilt_max_rad:g}"
         yield f"{steep}: a tilt that goes round costs real vehicles yaw, then thrust; set it to 'swing_twist'"
+
+
+def _counts_by_other_ticks(config: Config) -> Iterator[str]:
+    """Yield that an own controller, asked once a tick, would take its plan's step for the time between two ticks."""
+    dt_s, tick_s = config.controller.mpc.dt_s, 1.0 / config.agent.rate_hz
+    if config.controller.is_own and abs(dt_s - tick_s) > _SAME_TICK * tick_s:
+        asked = f"agent.rate_hz = {config.agent.rate_hz:g}: {config.controller.kind} is asked every {tick_s:.4g} s"
+        yield f"{asked}, and its dt_s is controller.mpc.dt_s = {dt_s:g}: integrals and differences by that are off"

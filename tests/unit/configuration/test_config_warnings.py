@@ -52,11 +52,27 @@ def test_an_obstacle_on_the_way_that_is_seen_too_late_is_named(speed_m_s: float,
     """At 10 m/s one was passed 0.33 m from its centre, of a radius of 1 m."""
     goto = f"mission.goto={{goals_ned_m=[[60,0,0]],speed_m_s={speed_m_s},accel_m_s2=3}}"
     alone = ("swarm.agents=1", "mission.kind=goto", goto, "start.positions_ned_m=[[0,0,0]]", "mission.duration_s=60")
+    tilts = "controller.mpc.u_max=0.31"  # it may accelerate by the 3 m/s2 that the mission asks for
     on_the_way, aside = (f"obstacles=[{{center_ned_m=[30,{east},-1]}}]" for east in (0.1, 20.0))
-    said = lines(*alone, "sitl.start=air", on_the_way)
+    said = lines(*alone, tilts, "sitl.start=air", on_the_way)
     assert len(said) == is_named
     assert all("obstacles.0: agent 0 sees it 1.25 m before its keep-out, at" in line for line in said)
-    assert lines(*alone, "sitl.start=air", aside) == []
+    assert lines(*alone, tilts, "sitl.start=air", aside) == []
+
+
+def test_a_reference_that_asks_for_more_than_the_controller_may_tilt_is_named() -> None:
+    """Of 4.05 m/s2 it has 2.0 by default: one was 4.5 m off a circle of 5 m, and the flight was "completed"."""
+    fast = "mission.circle.omega_rad_s=0.9"
+    (said,) = lines(fast)
+    assert "asks for up to 4.05 m/s2 along an axis, controller.mpc.u_max = 0.2 gives 2.00" in said
+    assert lines(fast, "controller.mpc.u_max=0.5") == lines(fast, "controller.kind=pid") == lines() == []
+
+
+def test_an_own_controller_is_told_that_it_is_asked_more_often_than_its_plans_step() -> None:
+    own = "controller.kind=tests.benches.misbehaving:Straight"
+    (said,) = lines(own, "agent.rate_hz=100")
+    assert "is asked every 0.01 s, and its dt_s is controller.mpc.dt_s = 0.02" in said
+    assert lines(own) == lines(own, "agent.rate_hz=100", "controller.mpc.dt_s=0.01") == []
 
 
 def test_real_vehicles_that_may_tilt_steeply_at_the_yaw_of_euler_angles_are_named() -> None:
