@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ import pytest
 import swarmctl
 from swarmctl.api.flight import Swarm, _numbers
 from swarmctl.api.flight_process import FlightProcess
-from swarmctl.config import Config
+from swarmctl.config import Config, dump
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
@@ -46,11 +47,21 @@ def test_type_checkers_are_told_every_name() -> None:
     assert Path(swarmctl.__file__).with_name("py.typed").exists()
 
 
+def load_again(config: Config) -> Config:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "config.toml"
+        path.write_text(dump(config))
+        return swarmctl.load(path)
+
+
 def test_values_are_set_as_python_has_them() -> None:
     config = swarmctl.load(
         set={"swarm.agents": 2, "start.center_ned_m": np.array([0.0, 1.0, -2.0]), "mission.duration_s": np.float64(5.0)}
     )
     assert (config.swarm.agents, config.start.center_ned_m) == (2, (0.0, 1.0, -2.0))
+    circle = {"center_ned_m": np.array([0.0, 1.0, -2.0]), "radius_m": np.float32(3.0)}
+    config = swarmctl.load(set={"mission.circle": circle, "controller.own": {"gains": np.array([1.0, 2.0])}})
+    assert config.controller.own == {"gains": [1.0, 2.0]} and load_again(config) == config
     with pytest.raises(swarmctl.ConfigError) as caught:
         swarmctl.load(set={"swarm.agents": 2.5, "swarm.agent": 1, "name": 3})
     assert len(caught.value.problems) == 3
