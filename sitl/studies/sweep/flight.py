@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.source import code_id
 from sitl.studies.sweep.figures import FIGURES, Row
 from sitl.studies.sweep.points import Axis, Flight
 from swarmctl.telemetry.evaluation.referee import evaluate
@@ -19,6 +18,7 @@ class FlySweep:
 
     base: Path  # the configuration to which swept values are applied
     axes: tuple[Axis, ...]
+    code: str  # digest of the sources that fly, own modules among them
 
     def __call__(self, flight: Flight) -> Row:
         """Fly one and return its row."""
@@ -31,5 +31,5 @@ class FlySweep:
         summary = evaluate(lockstep.recorded(), config.rules("lockstep"), outcome, problems)
         swept = {axis.key: axis.stored(value) for axis, (_, value) in zip(self.axes, flight.settings, strict=True)}
         figures = {figure.name: figure.of(summary) for figure in FIGURES}
-        ended = {"cpu_s": time.process_time() - began_s, "code": code_id()}
+        ended = {"cpu_s": time.process_time() - began_s, "code": self.code}
         return {**swept, "seed": flight.seed, "outcome": summary["outcome"], **figures, **ended}

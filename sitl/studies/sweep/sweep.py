@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -25,6 +26,7 @@ from swarmctl.config import Config, dump, load
 from swarmctl.core.text import told_apart
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError
 from swarmctl.files import replace_text
+from swarmctl.own_modules import OWN_FOLDER, OWN_KINDS, own_sources
 from swarmctl.telemetry.recording.file_names import STUDY_ROWS
 
 BASE = "config.toml"  # in the folder: the configuration to which swept values are applied
@@ -53,8 +55,10 @@ def sweep(options: SweepOptions) -> int:
         ConfigError: a combination is impossible, or the folder holds another sweep.
         StartError: a process ended by itself, or the folder can't be written.
     """
-    base = load(options.config, options.fixed)
     axes = parse_axes(options.sets, options.fixed)
+    base = load(options.config, options.fixed)
+    if not base.own_folder and _names_own(axes):  # flights load a copy of it, which is elsewhere
+        base = load(options.config, [*options.fixed, f"{OWN_FOLDER}=."])
     flights = flights_of(axes, base.seed if options.first_seed is None else options.first_seed, options.seeds)
     if problems := list(problems_of(flights, options.config, options.fixed)):
         raise ConfigError("sweep", problems)
@@ -62,21 +66,36 @@ def sweep(options: SweepOptions) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
         _claim(options.out, base)
     began_s, keyed = time.monotonic(), {_key(axes, flight): flight for flight in flights}
-    with RowStore(options.out, code_id(), schema=schema_of(axes), job_of=partial(_key_of_row, axes)) as store:
+    code = _code_of(base)
+    with RowStore(options.out, code, schema=schema_of(axes), job_of=partial(_key_of_row, axes)) as store:
         todo = [keyed[key] for key in store.missing(keyed)]
         print(f"{len(flights)} flights, {len(flights) - len(todo)} of them there already; {options.out}", flush=True)
         jobs = min(options.jobs, max(1, len(todo)))
-        flown = on_this_machine(todo, jobs, FlySweep(options.out / BASE, tuple(axes)))
+        flown = on_this_machine(todo, jobs, FlySweep(options.out / BASE, tuple(axes), code))
         count, errors = collect(flown, len(todo), store, noted=("failed", lambda row: row["outcome"] != "completed"))
     rows = [row for row in store.rows if _key_of_row(axes, row) in keyed]
     found = combinations(axes, rows)
-    report = write_page(options.out, axes, found, code_id(), config_text=dump(base))
+    report = write_page(options.out, axes, found, code, config_text=dump(base))
     _print_table(axes, found)
     print(f"{count} flown in {time.monotonic() - began_s:.0f} s; {options.out / STUDY_ROWS}, {report}")
     for error in errors:
         print(error, file=sys.stderr)
     failed = errors or any(row["outcome"] != "completed" for row in rows)
     return EXIT_MISSION if failed else EXIT_OK
+
+
+def _names_own(axes: Sequence[Axis]) -> bool:
+    """Return whether a swept value is an own controller or mission."""
+    return any(axis.key in OWN_KINDS and ":" in value for axis in axes for value in axis.values)
+
+
+def _code_of(base: Config) -> str:
+    """Return the digest of the sources that fly: those of swarmctl, and own modules of the configuration's folder."""
+    digest = hashlib.sha256(code_id().encode())
+    own = own_sources(base.own_folder)
+    for path in own:
+        digest.update(str(path.relative_to(base.own_folder)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12] if own else code_id()
 
 
 def _key(axes: Sequence[Axis], flight: Flight) -> _Key:

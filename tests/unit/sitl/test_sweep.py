@@ -7,7 +7,6 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from sitl.studies.campaign.source import code_id
 from sitl.studies.sweep.command import main
 from sitl.studies.sweep.figures import FIGURES, Row, combinations
 from sitl.studies.sweep.flight import FlySweep
@@ -29,7 +28,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> list[Flight]:
         swept = {axis.key: axis.stored(text) for axis, (_, text) in zip(self.axes, flight.settings, strict=True)}
         figures = {figure.name: float(len(asked)) for figure in FIGURES} | {"min_clearance_m": None}
         outcome = "failed" if flight.seed == 3 else "completed"
-        return {**swept, "seed": flight.seed, "outcome": outcome, **figures, "cpu_s": 0.0, "code": code_id()}
+        return {**swept, "seed": flight.seed, "outcome": outcome, **figures, "cpu_s": 0.0, "code": self.code}
 
     monkeypatch.setattr(FlySweep, "__call__", fly)
     return asked
@@ -134,6 +133,30 @@ def test_another_configuration_other_keys_or_other_code_are_refused(
     assert run(tmp_path, RADIUS) == 2
     assert "flown by other sources" in capsys.readouterr().err
     assert len(flown) == 2
+
+
+OWN = """
+from swarmctl.control.controllers.own import FeedbackController
+
+class Own(FeedbackController):
+    def accel_ned_m_s2(self, pos, vel, wanted_pos, wanted_vel, wanted_accel):
+        return {gain} * (wanted_pos - pos)
+"""
+
+
+def test_an_own_controller_that_has_changed_is_other_code_and_is_found_from_the_folder(
+    flown: list[Flight], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its rows were taken for those of the new one: "4 of them there already"."""
+    base, out, kinds = tmp_path / "base.toml", tmp_path / "out", "--set=controller.kind=dmpc,swept_own:Own"
+    base.write_text("[mission]\nkind = 'hover'\n")
+    (tmp_path / "swept_own.py").write_text(OWN.format(gain=1.0))
+    assert run(out, str(base), kinds) == run(out, str(base), kinds) == 0
+    assert len(flown) == 2
+    assert flown[1].config(out / "config.toml").own_folder == str(tmp_path)
+    (tmp_path / "swept_own.py").write_text(OWN.format(gain=12.5))
+    assert run(out, str(base), kinds) == 2
+    assert "flown by other sources" in capsys.readouterr().err
 
 
 def test_rows_of_a_combination_are_summed_up_over_seeds() -> None:
