@@ -44,7 +44,8 @@ class Flown:
 def fly(*apart: tuple[int, ...], lost: tuple[int, ...] = (), until_s: float = 16.0) -> Flown:
     """Fly a swap of hosts with these agents, whose links are all cut for a while, or of which one is lost for good."""
     flight = Lockstep(load(None, (*SWAP, hosts(*apart), "bus.relay=true")))
-    least_m, seen, is_cut = np.inf, (np.inf, (False,) * 4), False
+    least_m, is_cut = np.inf, False
+    seen: tuple[float, tuple[bool, ...]] = (np.inf, ())  # speed, and who is paused
     goals_ned_m = -np.array(flight.config.starts_ned_m())
     while not mission_t_s(flight) > until_s:
         flight.step()

@@ -75,7 +75,7 @@ class MissionState:
         airborne: the vehicle was found in the air at start-up.
         landing_seen: the autopilot lands, or has.
         outcome_before: outcome before the override, restored by resume.
-        first_tick_us: monotonic time from which the patience with the start counts.
+        patient_from_us: monotonic time from which the patience with the start counts.
         land_by_us: monotonic time at which a vehicle that is not at its landing place by then lands where it is.
         requested_us: monotonic time of the newest request to the autopilot.
     """
@@ -91,7 +91,7 @@ class MissionState:
         self.resumed_us = self.land_by_us = 0
         self.begin_utc_us: int | None = None
         self.gone_us: int | None = None
-        self.first_tick_us: int | None = None
+        self.patient_from_us: int | None = None
         self.requested_us = -REQUEST_PERIOD_US
         self.offered: OfferedMission | None = None
         self.keeps_up = self.had_control = self.pilot_override = self.may_take_control = False
@@ -187,10 +187,10 @@ class MissionState:
 
     def ends_in_s(self, now_us: int, utc_us: int) -> float:
         """Return when the mission, or what precedes or follows it, ends by itself [s]; NaN: it does not."""
-        if self.held or self.pilot_override or self.first_tick_us is None:
+        if self.held or self.pilot_override or self.patient_from_us is None:
             return math.nan
         if self.phase < Phase.TRACK:
-            return self.params.start_timeout_s - (now_us - self.first_tick_us) * 1e-6
+            return self.params.start_timeout_s - (now_us - self.patient_from_us) * 1e-6
         if self.phase is Phase.GOTO_LAND:
             return (self.land_by_us - now_us) * 1e-6
         return self.duration_us * 1e-6 - self.mission_t_s(utc_us)

@@ -123,8 +123,8 @@ def _release(mission: MissionState, now_us: int, state: VehicleState) -> None:
 
 def _excuse_waiting(mission: MissionState, now_us: int, since_us: int) -> None:
     """Let timeouts go on as if the time since then had not passed."""
-    if mission.first_tick_us is not None:
-        mission.first_tick_us += now_us - since_us
+    if mission.patient_from_us is not None:
+        mission.patient_from_us += now_us - since_us
     mission.land_by_us += now_us - since_us
 
 

@@ -71,7 +71,7 @@ class MissionStateMachine:
     def step(self, inputs: PhaseInputs) -> list[Command]:
         """Advance by one tick; returns the requests to the autopilot."""
         mission, state = self.mission, inputs.state
-        mission.first_tick_us = inputs.now_us if mission.first_tick_us is None else mission.first_tick_us
+        mission.patient_from_us = inputs.now_us if mission.patient_from_us is None else mission.patient_from_us
         mission.arming.update(inputs)
         if inputs.boots != mission.boots:
             mission.boots = inputs.boots
@@ -187,8 +187,8 @@ class MissionStateMachine:
     def _lose_patience(self, inputs: PhaseInputs, state: VehicleState) -> None:
         """Give up when the mission has not begun for too long."""
         mission, patience_s = self.mission, self.mission.params.start_timeout_s
-        if mission.phase >= Phase.TRACK or mission.held or mission.first_tick_us is None:
+        if mission.phase >= Phase.TRACK or mission.held or mission.patient_from_us is None:
             return
-        if inputs.now_us - mission.first_tick_us > patience_s * 1e6:
+        if inputs.now_us - mission.patient_from_us > patience_s * 1e6:
             cause = f"not tracking after {patience_s:.0f} s ({mission.phase.name})"
             mission.give_up(f"{cause}: {mission.waits_for}" if mission.waits_for else cause, inputs, state)

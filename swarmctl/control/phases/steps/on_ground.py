@@ -28,7 +28,9 @@ def standby(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
         mission.airborne = state.landed is Landed.IN_AIR
         if not mission.airborne and (too_low := mission.climb.too_low):
             return mission.refuse(too_low, inputs)
-        mission.first_tick_us = inputs.now_us  # the way to the start has its time, however long others were waited for
+        mission.patient_from_us = (
+            inputs.now_us
+        )  # the way to the start has its time, however long others were waited for
         mission.enter(Phase.ARM, inputs.now_us)
         return []
     stays = state.mode is FlightMode.EXTERNAL and inputs.arm_in is None and not inputs.armable
