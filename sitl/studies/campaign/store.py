@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Generic, Self, TypeVar
+from typing import ClassVar, Generic, Self, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -53,6 +53,8 @@ class RowStore(Generic[_Job]):
         StartError: the folder, or later its file, can't be written.
     """
 
+    advice: ClassVar[str] = "give a new --out"  # where rows are of other sources
+
     def __init__(
         self, directory: Path, code: str, mix: bool = False, *, schema: pa.Schema, job_of: Callable[[Row], _Job]
     ) -> None:
@@ -67,10 +69,7 @@ class RowStore(Generic[_Job]):
         if others and not mix:
             raise ConfigError(
                 str(self._path),
-                [
-                    f"flown by other sources ({', '.join(others)}; these are {code}): give a new --out, "
-                    "or --mix to go on with both"
-                ],
+                [f"flown by other sources ({', '.join(others)}; these are {code}): {self.advice}"],
             )
         self._finished = {job_of(row) for row in self.rows}
         self._saved_s, self._saved_rows = time.monotonic(), len(self.rows)
@@ -106,6 +105,8 @@ class RowStore(Generic[_Job]):
 
 class Store(RowStore[Trial]):
     """Rows of one campaign."""
+
+    advice: ClassVar[str] = "give a new --out, or --mix to go on with both"
 
     def __init__(self, directory: Path, code: str, mix: bool = False) -> None:
         super().__init__(directory, code, mix, schema=SCHEMA, job_of=trial_of)

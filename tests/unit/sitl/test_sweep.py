@@ -131,7 +131,9 @@ def test_another_configuration_other_keys_or_other_code_are_refused(
     assert "other columns" in capsys.readouterr().err
     monkeypatch.setattr("sitl.studies.sweep.sweep.code_id", lambda: "another")
     assert run(tmp_path, RADIUS) == 2
-    assert "flown by other sources" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "flown by other sources" in said and "give a new --out" in said
+    assert "--mix" not in said, "a sweep has no such option"
     assert len(flown) == 2
 
 
