@@ -117,6 +117,7 @@ def make_world_model(setup: AgentSetup, ports: Ports) -> WorldModel:
         note=ports.note,
         vouchers=setup.vouchers,
         quorum=setup.quorum,
+        model=setup.vehicle_model,
     )
 
 

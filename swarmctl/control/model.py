@@ -43,10 +43,15 @@ class VehicleModelParams(Params):
         return Lag(self.attitude_rad_s, self.attitude_damping) if self.attitude_rad_s > 0 else None
 
     @property
+    def lag_s(self) -> float:
+        """Return the time by which an attitude is later than setpoints that change steadily, besides the dead time."""
+        lag = self.lag()
+        return 0.0 if lag is None else lag.ramp_delay_s
+
+    @property
     def response_s(self) -> float:
         """Return the time by which accelerations are later than what asks for them: dead time, and lag of a ramp."""
-        lag = self.lag()
-        return self.delay_s + (0.0 if lag is None else lag.ramp_delay_s)
+        return self.delay_s + self.lag_s
 
     def u_max(self) -> float:
         """Return the largest horizontal part of the body's down axis."""

@@ -117,7 +117,7 @@ def test_others_keep_clear_of_where_the_last_attitude_takes_a_vehicle(
             running.kill(victim)
 
     assert dies_amid(end) >= 0.8
-    monkeypatch.setattr(world_model, "without_setpoints", lambda path: path)
+    monkeypatch.setattr(world_model, "without_setpoints", lambda path, **_: path)
     assert dies_amid(end) < 0.48, "negative control: bodies touch where it is expected to turn as planned"
 
 
@@ -134,7 +134,7 @@ def test_an_agent_that_is_started_again_at_once_does_not_hide_where_its_vehicle_
         return fly_now(*PASSING, at=begin, until=lambda running: mission_t_s(running) > 4.4, seed=2).separation_m()
 
     assert restarted() >= 0.85
-    monkeypatch.setattr(world_model, "without_setpoints", lambda path: path)
+    monkeypatch.setattr(world_model, "without_setpoints", lambda path, **_: path)
     assert restarted() < 0.8, "negative control"
 
 

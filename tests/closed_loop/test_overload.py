@@ -135,7 +135,7 @@ def test_whose_paths_come_late_is_expected_to_fly_on_without_setpoints_too(monke
     """Six starts that miss nine of ten deadlines and fly the first input keep 0.79 to 1.08 m, else 0.33 to 0.45."""
     monkeypatch.setattr(setpoint, "HELD_MAX_US", 0)
     assert swapped(*UNPROTECTED, until=over, at={0.5: one_tick_of(10)}, seed=3).separation_m() >= 0.85
-    monkeypatch.setattr(world_model, "without_setpoints", lambda path: path)
+    monkeypatch.setattr(world_model, "without_setpoints", lambda path, **_: path)
     assert swapped(*UNPROTECTED, until=closer_than(0.6), at={0.5: one_tick_of(10)}, seed=3).separation_m() < 0.6
 
 

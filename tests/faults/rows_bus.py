@@ -151,7 +151,7 @@ ROWS = (
         finally_={"they don't arrive": arrived},
         off=Off(
             settings=("separation.age_accel_m_s2=0",),
-            patches=(*FLIES_ON.patches, (world_model, "without_setpoints", lambda path: path)),
+            patches=(*FLIES_ON.patches, (world_model, "without_setpoints", lambda path, **_: path)),
         ),
     ),
     SimulatedRow(

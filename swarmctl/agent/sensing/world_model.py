@@ -28,6 +28,7 @@ from swarmctl.control.collision.separation import (
     without_setpoints,
 )
 from swarmctl.control.estimation.flown_by_others import CREEP_M_S
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory
@@ -41,6 +42,7 @@ _STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
 _DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
 _HOLDS = frozenset((FlightMode.HOLD,))
 _MOVES = frozenset(FlightMode) - _HOLDS
+_FOLLOWS = VehicleModelParams()  # at once, without drag
 
 
 class WorldModel:
@@ -54,6 +56,7 @@ class WorldModel:
         rate_hz: tick rate of every agent.
         vouchers: agents of which each sender may say that they have ended.
         quorum: see `AgentSetup`.
+        model: of the own vehicle; those of peers are taken for such ones.
         note: receives the events `refused` (see `Refusals`), `obstacles_changed` with the list as it was received,
             `peer_ended` with the process that has, and `unresponsive`: a peer within reach is on the bus and has
             published no accepted path for `lost_after_s`; also when that ends, with its duration.
@@ -70,9 +73,11 @@ class WorldModel:
         note: Callable[..., None],
         vouchers: Mapping[str, Set[int]],
         quorum: int = 1,
+        model: VehicleModelParams = _FOLLOWS,
     ) -> None:
         self._agent, self._params, self._bus, self._note = agent, params, bus, note
         self._quorum = quorum
+        self._ends_as = {"lag_s": model.lag_s, "drag_1_s": model.drag_1_s}
         self._budget = params.budget
         self.refusals, self.presence = Refusals(note), Presence(bus)
         self.clocks = PeerClocks(peers, note)
@@ -275,11 +280,11 @@ class WorldModel:
         if status.boot_id == path.boot_id and not self._flies_itself(agent):
             return (path,)  # as its autopilot or a pilot flies it
         if self._ends.has_ended(agent, path.boot_id):  # whatever a process says that was started after it
-            return (without_setpoints(path),)
+            return (without_setpoints(path, **self._ends_as),)
         oldest_us = utc_us - _EXPECTED_US
         if path.t0_utc_us >= oldest_us or all(late.agent != agent for late in self.paths.late(oldest_us)):
             return (path,)
-        return path, without_setpoints(path)
+        return path, without_setpoints(path, **self._ends_as)
 
     def exclude(self, agent: int) -> None:
         """Believe that the process of a peer has ended; another process under its number takes part again."""

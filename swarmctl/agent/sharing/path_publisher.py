@@ -50,6 +50,7 @@ class PathPublisher:
         self._dt_us, self._steps, self._widens_in_gusts = controller.dt_us, controller.steps, widens_in_gusts
         self._max_age_us = round(setup.params.failsafe.state_max_age_s * 1e6)
         self._sharing = PathSharing(setup.params.path_sharing, setup.separation)
+        self._lag_s, self._drag_1_s = setup.vehicle_model.lag_s, setup.vehicle_model.drag_1_s
         self._gust, self._stop_judge = GustWatch(), StopJudge()
         self._published_us, self._margin_m = -_COMMITTED_EVERY_US, 0.0
         self._flown: tuple[Plan, int] | None = None  # newest plan that was flown, and when its last setpoint acts
@@ -123,7 +124,8 @@ class PathPublisher:
             t0_us, dt_us = now_us + self._delay_us, self._dt_us
             if self._is_recent(state):
                 stops, ahead_s = self._stop_judge.update(state), self._ahead_s(t0_us, state.t_us)
-                pos = predict_flown_by_others(state, ahead_s, self._setup.separation.brake_m_s2, stops=stops)
+                limits = {"brake_m_s2": self._setup.separation.brake_m_s2, "drag_1_s": self._drag_1_s}
+                pos = predict_flown_by_others(state, ahead_s, stops=stops, **limits)
                 margin_m += 0.0 if stops or not is_steered(state) else STEERED_MARGIN_M
             else:
                 pos, apart_m = self._without_link(state, t0_us)
@@ -149,11 +151,13 @@ class PathPublisher:
         keeps_s, coasts_s = self._ports.autopilot.setpoint_loss_s, self._ports.autopilot.landing_delay_s
         assert keeps_s is not None and coasts_s is not None
         limits = {"keeps_s": keeps_s, "coasts_s": coasts_s, "brake_m_s2": self._setup.separation.brake_m_s2}
-        deaf = predict_without_setpoints(state, self._ahead_s(t0_us, state.t_us), **limits)
+        limits["drag_1_s"] = self._drag_1_s
+        ahead_s = self._ahead_s(t0_us, state.t_us)
+        deaf = predict_without_setpoints(state, ahead_s, **limits)
         if self._flown is None or self._flown[1] <= state.t_us:
             return deaf, 0.0
         plan, last_us = self._flown
-        heard = predict_after_setpoints(plan, last_us, self._ahead_s(t0_us, last_us), **limits)
+        heard = predict_after_setpoints(plan, last_us, self._ahead_s(t0_us, last_us), lag_s=self._lag_s, **limits)
         return _middle(heard, deaf, self._dt_us)
 
     def _unheard(self, state: VehicleState, flown: Plan, heard_us: int) -> tuple[Array, float]:
@@ -173,6 +177,7 @@ class PathPublisher:
             keeps_s=max(0.0, keeps_s - kept_s),
             coasts_s=max(0.0, coasts_s - kept_s),
             brake_m_s2=self._setup.separation.brake_m_s2,
+            drag_1_s=self._drag_1_s,
         )
         return _middle(flown.pos_ned_m, deaf, flown.dt_us)
 

@@ -199,22 +199,32 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
     return found
 
 
-def without_setpoints(path: PredictedPath) -> PredictedPath:
+def without_setpoints(path: PredictedPath, *, lag_s: float = 0.0, drag_1_s: float = 0.0) -> PredictedPath:
     """Return the path of a vehicle that has received no setpoint since it began to fly a path.
 
-    Its autopilot keeps the last attitude for a while, so the level acceleration of the first points goes on, instead of
-    what was planned to follow. Where the returned path ends the autopilot brakes, as beyond the end of any path.
+    Its autopilot keeps the last attitude for a while, so the level acceleration goes on that the vehicle has when it
+    has taken that attitude, instead of what was planned to follow. Where the returned path ends the autopilot brakes,
+    as beyond the end of any path.
+
+    Args:
+        path: what was planned.
+        lag_s: time in which the vehicle takes the attitude of a setpoint. It flies as planned meanwhile: a path that
+            turns goes on to turn.
+        drag_1_s: linear drag over mass.
     """
-    dt_s, (first, second) = path.dt_us * 1e-6, path.pos_ned_m[:2]
-    bend = path.pos_ned_m[2] - 2.0 * second + first if len(path.pos_ned_m) > 2 else np.zeros(3)
+    dt_s = path.dt_us * 1e-6
+    lag = max(0, min(round(min(lag_s, _KEEPS_S) / dt_s), len(path.pos_ned_m) - 3))
+    first, second = path.pos_ned_m[lag : lag + 2]
+    bend = path.pos_ned_m[lag + 2] - 2.0 * second + first if len(path.pos_ned_m) > 2 else np.zeros(3)
     bend[2] = 0.0
     most_m, size_m = _MOST_M_S2 * dt_s**2, math.hypot(bend[0], bend[1])
     bend *= most_m / max(size_m, most_m)
     accel = bend / dt_s**2
     vel = (second - first) / dt_s - 0.5 * dt_s * accel  # at the first point
-    ahead_s = grid(max(1, round(_STOPS_US / path.dt_us))) * dt_s
-    pos = without_setpoints_ned_m(first, vel, accel, ahead_s, keeps_s=_KEEPS_S, coasts_s=_KEEPS_S)
-    return replace(path, pos_ned_m=pos)
+    ahead_s, keeps_s = grid(max(1, round(_STOPS_US / path.dt_us) - lag)) * dt_s, _KEEPS_S - lag * dt_s
+    limits = {"keeps_s": keeps_s, "coasts_s": keeps_s, "drag_1_s": drag_1_s}
+    pos = without_setpoints_ned_m(first, vel, accel, ahead_s, **limits)
+    return replace(path, pos_ned_m=np.concatenate((path.pos_ned_m[:lag], pos)) if lag else pos)
 
 
 def keep_out_of_peer(

@@ -22,11 +22,14 @@ _LEAST_COS = 0.5  # of a tilt that is kept
 _BRAKES_M_S = 0.2  # by which the speed of one that brakes falls in that time
 
 
-def predict_flown_by_others(state: VehicleState, ahead_s: Array, brake_m_s2: float, *, stops: bool) -> Array:
+def predict_flown_by_others(
+    state: VehicleState, ahead_s: Array, brake_m_s2: float, *, stops: bool, drag_1_s: float = 0.0
+) -> Array:
     """Return positions (N, 3), NED [m], at `ahead_s` (N,) after a state.
 
     The velocity is reduced where the vehicle `stops`, as autopilots do but at `brake_m_s2` at most. Otherwise it is
-    continued; where somebody steers, it changes as the tilt says first. The tilt of who hovers says what wind there is.
+    continued; where somebody steers, it changes as the tilt says first. The tilt of who hovers says what wind there is,
+    and some of that of who flies is needed against the drag, `drag_1_s` over its mass in still air.
     """
     ahead_s = np.maximum(ahead_s, 0.0)
     if stops and math.hypot(*state.vel_ned_m_s[:2]) < CREEP_M_S:
@@ -35,12 +38,12 @@ def predict_flown_by_others(state: VehicleState, ahead_s: Array, brake_m_s2: flo
         ahead_s = t_s - 0.5 * brake_m_s2 * t_s * t_s / max(speed_m_s, 1e-6)  # to travel as far at the present speed
     elif stops:
         brake_m_s2 = min(brake_m_s2, HOLD_BRAKE_M_S2 if state.mode is FlightMode.HOLD else BRAKE_M_S2)
-        motion = (state.vel_ned_m_s, _level_accel_ned_m_s2(state))
+        motion = (state.vel_ned_m_s, _level_accel_ned_m_s2(state, drag_1_s))
         return state.pos_ned_m + settling_displacement(*motion, ahead_s, brake_m_s2=brake_m_s2)
     pos = state.pos_ned_m + ahead_s[:, None] * state.vel_ned_m_s
     if not stops and is_steered(state):
         steered_s = np.minimum(ahead_s, _STEERED_S)
-        pos += (steered_s * (ahead_s - 0.5 * steered_s))[:, None] * _level_accel_ned_m_s2(state)
+        pos += (steered_s * (ahead_s - 0.5 * steered_s))[:, None] * _level_accel_ned_m_s2(state, drag_1_s)
     return np.asarray(pos)
 
 
@@ -50,42 +53,58 @@ def is_steered(state: VehicleState) -> bool:
 
 
 def predict_without_setpoints(
-    state: VehicleState, ahead_s: Array, *, keeps_s: float, coasts_s: float, brake_m_s2: float
+    state: VehicleState, ahead_s: Array, *, keeps_s: float, coasts_s: float, brake_m_s2: float, drag_1_s: float = 0.0
 ) -> Array:
     """Return positions (N, 3), NED [m], at `ahead_s` (N,) after the last state before a vehicle hears nothing more.
 
-    Its autopilot keeps the attitude for `keeps_s`, which accelerates it in the plane, levels and coasts on until
-    `coasts_s`, and then brakes and lands.
+    Its autopilot keeps the attitude for `keeps_s`, which accelerates it in the plane as far as the drag leaves,
+    `drag_1_s` over its mass, levels and coasts on until `coasts_s`, and then brakes and lands.
     """
-    motion = (state.pos_ned_m, state.vel_ned_m_s, _level_accel_ned_m_s2(state))
-    return without_setpoints_ned_m(*motion, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)
+    limits = {"keeps_s": keeps_s, "coasts_s": coasts_s, "brake_m_s2": brake_m_s2, "drag_1_s": drag_1_s}
+    accel_ned_m_s2 = _level_accel_ned_m_s2(state, drag_1_s)
+    return without_setpoints_ned_m(state.pos_ned_m, state.vel_ned_m_s, accel_ned_m_s2, ahead_s, **limits)
 
 
 def predict_after_setpoints(
-    plan: Plan, last_us: int, ahead_s: Array, *, keeps_s: float, coasts_s: float, brake_m_s2: float
+    plan: Plan,
+    last_us: int,
+    ahead_s: Array,
+    *,
+    keeps_s: float,
+    coasts_s: float,
+    brake_m_s2: float,
+    drag_1_s: float = 0.0,
+    lag_s: float = 0.0,
 ) -> Array:
     """Return positions (N, 3), NED [m], at `ahead_s` (N,) after the last setpoint of a plan has acted, at `last_us`.
 
-    As `predict_without_setpoints`, of a vehicle that has followed the plan until then.
+    As `predict_without_setpoints`, of a vehicle that follows the plan until it has the attitude of that setpoint,
+    `lag_s` later.
     """
-    last = len(plan.pos_ned_m) - 1
-    step = max(0.0, (last_us - plan.t0_us) / plan.dt_us)
+    last, lag_s = len(plan.pos_ned_m) - 1, min(lag_s, keeps_s)
+    since_steps, step_s = (last_us - plan.t0_us) / plan.dt_us, plan.dt_us * 1e-6
+    step = max(0.0, since_steps + lag_s / step_s)
     pos, vel = (interpolated(points, np.array([step]), last)[0] for points in (plan.pos_ned_m, plan.vel_ned_m_s))
     begun = min(int(step), last - 1)
-    accel_ned_m_s2 = (plan.vel_ned_m_s[begun + 1] - plan.vel_ned_m_s[begun]) / (plan.dt_us * 1e-6)
+    accel_ned_m_s2 = (plan.vel_ned_m_s[begun + 1] - plan.vel_ned_m_s[begun]) / step_s
     accel_ned_m_s2[2] = 0.0
-    motion = (pos, vel, accel_ned_m_s2)
-    return without_setpoints_ned_m(*motion, ahead_s, keeps_s=keeps_s, coasts_s=coasts_s, brake_m_s2=brake_m_s2)
+    limits = {"keeps_s": keeps_s - lag_s, "coasts_s": max(0.0, coasts_s - lag_s)}
+    limits |= {"brake_m_s2": brake_m_s2, "drag_1_s": drag_1_s}
+    found = without_setpoints_ned_m(pos, vel, accel_ned_m_s2, np.maximum(ahead_s - lag_s, 0.0), **limits)
+    follows = ahead_s < lag_s
+    found[follows] = interpolated(plan.pos_ned_m, since_steps + ahead_s[follows] / step_s, last)
+    return found
 
 
 def _speed_m_s(state: VehicleState) -> float:
     return math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
 
 
-def _level_accel_ned_m_s2(state: VehicleState) -> Array:
-    """Return the acceleration (3,) in the plane that an attitude gives to a vehicle that keeps its height."""
+def _level_accel_ned_m_s2(state: VehicleState, drag_1_s: float) -> Array:
+    """Return the acceleration (3,) in the plane that attitude and drag give to a vehicle that keeps its height."""
     tilt_ned = body_z_ned(state.q_nb)
-    return np.append(-GRAVITY_M_S2 / max(_LEAST_COS, tilt_ned[2]) * tilt_ned[:2], 0.0)
+    by_tilt = -GRAVITY_M_S2 / max(_LEAST_COS, tilt_ned[2]) * tilt_ned[:2]
+    return np.append(by_tilt - drag_1_s * state.vel_ned_m_s[:2], 0.0)
 
 
 class StopJudge:

@@ -177,7 +177,8 @@ def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np
     times_us, begins = np.unique(points["t_us"], return_index=True)
     planned = dict(zip(times_us.tolist(), np.split(points, begins[1:]), strict=True)) if len(points) else {}
     like = planned[int(times_us[0])]["at_us"] if planned else np.arange(_COAST_POINTS) * round(_COAST_S * 1e6)
-    delay_us, stop_judge = Predictor(config.model_of(peer)).delay_us, StopJudge()
+    model = config.model_of(peer)
+    delay_us, stop_judge, brake_m_s2 = Predictor(model).delay_us, StopJudge(), config.separation.brake_m_s2
     for row, begin_us in zip(rows, begins_utc_us(rows).tolist(), strict=True):
         t_us, utc_us = int(row["t_us"]), int(row["utc_us"])
         if t_us in planned:
@@ -188,7 +189,7 @@ def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np
             state = _state(row)
             ahead_s = (at_us - state.t_us).astype(np.float64) * 1e-6
             stops = stop_judge.update(state)
-            pos = predict_flown_by_others(state, ahead_s, config.separation.brake_m_s2, stops=stops)
+            pos = predict_flown_by_others(state, ahead_s, brake_m_s2, stops=stops, drag_1_s=model.drag_1_s)
         else:
             continue
         path = PredictedPath(

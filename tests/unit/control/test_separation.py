@@ -59,6 +59,23 @@ def test_without_setpoints_the_first_level_acceleration_goes_on_and_then_it_brak
     assert stopped_m == pytest.approx(speed_m_s**2 / (2.0 * BRAKE_M_S2) + ANSWER_S * speed_m_s, rel=0.15)
 
 
+def test_without_setpoints_a_turn_goes_on_until_the_attitude_is_that_of_the_last_one() -> None:
+    """Then the acceleration of that time is kept, less what drag takes of what it adds."""
+    t_s = 0.05 * np.arange(41)
+    turns = np.stack([2.0 * np.sin(t_s), 2.0 - 2.0 * np.cos(t_s), np.full(41, -2.0)], axis=1)  # 2 m at 1 rad/s
+    path = replace(peer(turns), dt_us=50_000)
+    for drag_1_s in (0.0, 1.0):
+        flown = without_setpoints(path, lag_s=0.2, drag_1_s=drag_1_s).pos_ned_m
+        np.testing.assert_allclose(flown[:5], turns[:5], atol=2e-3)
+        middle_s = 0.05 * np.arange(4.5, 9.0)  # between points, while the attitude is kept
+        vel = np.diff(flown[4:10], axis=0) / 0.05
+        kept_s = middle_s - 0.2 if not drag_1_s else 1.0 - np.exp(0.2 - middle_s)
+        at_once = np.array([2.0 * np.cos(0.2), 2.0 * np.sin(0.2)])
+        gained = np.outer(kept_s, [-2.0 * np.sin(0.2), 2.0 * np.cos(0.2)])
+        np.testing.assert_allclose(vel[:, :2], at_once + gained, atol=0.06)
+    np.testing.assert_array_equal(without_setpoints(path, lag_s=0.0).pos_ned_m, without_setpoints(path).pos_ned_m)
+
+
 @pytest.mark.parametrize("points", [2, 3])
 def test_without_setpoints_no_more_acceleration_is_kept_than_a_vehicle_has(points: int) -> None:
     jump = peer(np.array([[0.0, 0.0, -2.0], [0.0, 0.0, -2.0], [9.0, 0.0, -2.0]])[:points])
