@@ -39,6 +39,7 @@ from sitl.plant.vehicle import Array
 from sitl.vehicle_parts import IDLE, Command
 from swarmctl.core.types import FlightMode, Landed
 
+BRAKE_M_S2 = 7.5  # largest deceleration of BRAKE
 FORCE_ARM, FORCE_DISARM = 2989.0, 21196.0  # p2 of ARM/DISARM
 
 
@@ -84,7 +85,7 @@ class ArduCopter:
             CopterMode.ALT_HOLD: self._alt_hold,
             CopterMode.GUIDED: self._fly_guided,
             CopterMode.LOITER: self._loiter,
-            CopterMode.BRAKE: self._loiter,
+            CopterMode.BRAKE: self._brake,
             CopterMode.RTL: self._return,
             CopterMode.LAND: self._land,
         }
@@ -358,12 +359,16 @@ class ArduCopter:
     def _loiter(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
         return self._navigator.hold(estimate, dt_s), self._navigator.hold_height(estimate, dt_s)
 
+    def _brake(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
+        return self._navigator.stop(estimate, BRAKE_M_S2, dt_s), self._navigator.hold_height(estimate, dt_s)
+
     def _land(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
         speed_m_s = self.parameters.metres("LAND_SPEED")
         ground_z_m = self.home_ned_m[2] if self.home_ned_m is not None else estimate.pos_ned_m[2]
         if ground_z_m - estimate.pos_ned_m[2] > self.parameters.metres("LAND_ALT_LOW"):
             speed_m_s = self.parameters.metres("LAND_SPEED_HIGH") or self.parameters.metres("WPNAV_SPEED_DN")
-        return self._navigator.hold(estimate, dt_s), self._navigator.climb(estimate, -speed_m_s, dt_s)
+        attitude = self._navigator.stop(estimate, self.parameters.metres("WPNAV_ACCEL"), dt_s)
+        return attitude, self._navigator.climb(estimate, -speed_m_s, dt_s)
 
     def _fly_guided(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
         return self.guided.fly(estimate, self.target_q_nb, self._now_us, dt_s)

@@ -11,6 +11,7 @@ import math
 
 from sitl.acceleration import attitude_for, limited
 from sitl.arducopter.parameters import CopterParameters
+from sitl.arducopter.shaped_stop import ShapedStop, Xy
 from sitl.plant.sensors import Estimate
 from sitl.plant.vehicle import Array
 from swarmctl.core.frames import GRAVITY_M_S2
@@ -32,7 +33,8 @@ class CopterNavigator:
         self._parameters = parameters
         self.hover_01 = hover_thrust_01
         self._yaw_rad = 0.0
-        self._hold_xy_m: tuple[float, float] | None = None
+        self._hold_xy_m: Xy | None = None
+        self._stop: ShapedStop | None = None
         self._hold_z_m: float | None = None
         self._z_m = self._down_m_s = 0.0  # shaped height and speed
         self._integral_m_s2 = [0.0, 0.0, 0.0]
@@ -46,6 +48,9 @@ class CopterNavigator:
         self._integral_m_s2 = [0.0, 0.0, 0.0]
         down = estimate.down_axis_ned
         self._acc_m_s2 = [-GRAVITY_M_S2 * down[0], -GRAVITY_M_S2 * down[1]]
+        self._stop = None
+        if math.hypot(*estimate.vel_ned_m_s[:2]) > HOLD_SPEED_M_S:
+            self._stop = ShapedStop(self._parameters, estimate, (self._acc_m_s2[0], self._acc_m_s2[1]))
 
     # --- vertical: throttle before angle boost ---
 
@@ -91,15 +96,22 @@ class CopterNavigator:
     def hold(self, estimate: Estimate, dt_s: float) -> Array:
         """Return the attitude that brakes, latches the position and holds it."""
         x_m, y_m, _ = estimate.pos_ned_m
+        self._stop = None
         if self._hold_xy_m is None and math.hypot(*estimate.vel_ned_m_s[:2]) < HOLD_SPEED_M_S:
             self._hold_xy_m = x_m, y_m
         if self._hold_xy_m is None:
             return self._steer(estimate, 0.0, 0.0, dt_s)
         return self._toward(estimate, self._hold_xy_m, dt_s)
 
+    def stop(self, estimate: Estimate, brake_m_s2: float, dt_s: float) -> Array:
+        """Return the attitude that brings the vehicle to rest as BRAKE and LAND do, at that much at most."""
+        if self._stop is None:
+            return self.hold(estimate, dt_s)
+        return self._lean(estimate, self._stop.accel_m_s2(estimate, brake_m_s2, dt_s), self._tilt_m_s2(), dt_s)
+
     def go_to(self, estimate: Estimate, xy_m: tuple[float, float], dt_s: float) -> Array:
         """Return the attitude that flies to a place, which is held from then on."""
-        self._hold_xy_m = xy_m
+        self._hold_xy_m, self._stop = xy_m, None
         return self._toward(estimate, xy_m, dt_s)
 
     def _toward(self, estimate: Estimate, xy_m: tuple[float, float], dt_s: float) -> Array:
@@ -118,11 +130,15 @@ class CopterNavigator:
             if not estimate.on_ground and abs(error[axis]) < 1.0:
                 summed = self._integral_m_s2[axis] + gain_i * error[axis] * dt_s
                 self._integral_m_s2[axis] = max(-XY_I_MAX_M_S2, min(XY_I_MAX_M_S2, summed))
-        tilt_m_s2 = GRAVITY_M_S2 * math.tan(math.radians(0.01 * self._parameters.real("ANGLE_MAX")))
-        limit = min(self._parameters.metres("WPNAV_ACCEL"), tilt_m_s2)
-        acc = limited(gain * error[0] + self._integral_m_s2[0], gain * error[1] + self._integral_m_s2[1], limit)
-        if estimate.on_ground:
-            acc = 0.0, 0.0
+        acc = gain * error[0] + self._integral_m_s2[0], gain * error[1] + self._integral_m_s2[1]
+        return self._lean(estimate, acc, min(self._parameters.metres("WPNAV_ACCEL"), self._tilt_m_s2()), dt_s)
+
+    def _tilt_m_s2(self) -> float:
+        """Return the level acceleration at the largest tilt."""
+        return GRAVITY_M_S2 * math.tan(math.radians(0.01 * self._parameters.real("ANGLE_MAX")))
+
+    def _lean(self, estimate: Estimate, acc_m_s2: Xy, most_m_s2: float, dt_s: float) -> Array:
+        acc = (0.0, 0.0) if estimate.on_ground else limited(*acc_m_s2, most_m_s2)
         change = limited(acc[0] - self._acc_m_s2[0], acc[1] - self._acc_m_s2[1], JERK_MAX_M_S3 * dt_s)
         self._acc_m_s2 = [self._acc_m_s2[0] + change[0], self._acc_m_s2[1] + change[1]]
         return attitude_for((self._acc_m_s2[0], self._acc_m_s2[1], 0.0), self._yaw_rad)

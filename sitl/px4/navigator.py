@@ -11,6 +11,7 @@ import math
 from sitl.acceleration import attitude_for, limited
 from sitl.plant.sensors import Estimate
 from sitl.px4.parameters import Parameters
+from sitl.px4.stop_path import StopPath, Xy
 from sitl.vehicle_parts import Command
 from swarmctl.core.frames import GRAVITY_M_S2
 
@@ -18,7 +19,7 @@ VEL_P_1_S = 1.8  # MPC_XY_VEL_P_ACC
 VEL_I_1_S2 = 0.4
 Z_VEL_P_1_S = 4.0  # MPC_Z_VEL_P_ACC
 Z_VEL_I_1_S2 = 2.0
-ACC_MAX_M_S2 = 2.2  # of a real PX4 that lands, whose MPC_ACC_HOR is 3 m/s2: it brakes along ramps
+ACC_MAX_M_S2 = 2.2  # on the way to a place; to rest it follows a `StopPath`
 ACC_UP_MAX_M_S2 = 4.0
 ACC_DOWN_MAX_M_S2 = 3.0
 JERK_MAX_M_S3 = 20.0  # 0.4 m/s2, 2.3 deg a tick: the thesis' attitude loop follows ramps, not jumps
@@ -38,7 +39,8 @@ class Navigator:
         self.speed_m_s: float | None = None  # of DO_CHANGE_SPEED, instead of MPC_XY_CRUISE
         self._parameters = parameters
         self._yaw_rad = 0.0
-        self._hold_xy_m: tuple[float, float] | None = None
+        self._hold_xy_m: Xy | None = None
+        self._stop: StopPath | None = None
         self._hold_z_m: float | None = None
         self._integral_m_s2 = [0.0, 0.0, 0.0]
         self._acc_m_s2 = [0.0, 0.0]
@@ -47,7 +49,10 @@ class Navigator:
     def engage(self, estimate: Estimate, *, fresh: bool) -> None:
         """Brake, then hold where that ends. `fresh`: reset the integrals too (another controller flew before)."""
         self._yaw_rad = estimate.yaw_rad
-        self._hold_xy_m = self._hold_z_m = None
+        self._hold_xy_m = self._hold_z_m = self._stop = None
+        if math.hypot(*estimate.vel_ned_m_s[:2]) > HOLD_SPEED_M_S:
+            limits = self._parameters.real("MPC_ACC_HOR"), self._parameters.real("MPC_JERK_AUTO")
+            self._stop = StopPath(estimate.pos_ned_m[:2], estimate.vel_ned_m_s[:2], *limits)
         if fresh:
             self._integral_m_s2 = [0.0, 0.0, 0.0]
             down = estimate.down_axis_ned
@@ -105,7 +110,7 @@ class Navigator:
 
     def descend_blind(self, estimate: Estimate, dt_s: float) -> Command:
         """Descend without a position: level, at MPC_LAND_SPEED, drifting with the wind."""
-        self._hold_xy_m = self._hold_z_m = None
+        self._hold_xy_m = self._hold_z_m = self._stop = None
         sink = self._parameters.real("MPC_LAND_SPEED")
         self._speed_ned_m_s = 0.0, 0.0, sink
         acc_d = self._acc_down(estimate, sink, dt_s)
@@ -130,14 +135,33 @@ class Navigator:
         return limited(north, east, max(0.0, min(cruise, self._parameters.real("MPC_XY_VEL_MAX"))))
 
     def _fly(self, estimate: Estimate, speed_z_m_s: float, dt_s: float) -> Command:
-        wanted = *self._speed_xy(estimate), speed_z_m_s
-        self._speed_ned_m_s = wanted
+        if self._stop is not None and self._hold_xy_m is None:
+            acc_n, acc_e = self._brake(self._stop, estimate, speed_z_m_s, dt_s)
+        else:
+            wanted = self._speed_xy(estimate)
+            self._speed_ned_m_s = *wanted, speed_z_m_s
+            acc_n, acc_e = limited(*self._toward(estimate, wanted, dt_s), ACC_MAX_M_S2)
+        return self._aim(estimate, acc_n, acc_e, self._acc_down(estimate, speed_z_m_s, dt_s), dt_s=dt_s)
+
+    def _brake(self, stop: StopPath, estimate: Estimate, speed_z_m_s: float, dt_s: float) -> Xy:
+        """Return the acceleration (north, east) that follows a way to rest, whose end is held from then on."""
+        pos_m, vel_m_s, acc_m_s2 = stop.advance(dt_s)
+        if stop.arrived:
+            self._hold_xy_m = stop.end_m
+        gain = self._parameters.real("MPC_XY_P")
+        north, east = (vel_m_s[axis] + gain * (pos_m[axis] - estimate.pos_ned_m[axis]) for axis in (0, 1))
+        self._speed_ned_m_s = north, east, speed_z_m_s
+        acc_n, acc_e = self._toward(estimate, (north, east), dt_s)
+        less_n, less_e = stop.damping_m_s2(estimate.vel_ned_m_s[:2], dt_s)
+        return acc_n + acc_m_s2[0] - less_n, acc_e + acc_m_s2[1] - less_e
+
+    def _toward(self, estimate: Estimate, wanted_m_s: Xy, dt_s: float) -> Xy:
+        """Return the acceleration (north, east) towards a velocity."""
         acc: list[float] = []
         for axis in (0, 1):
-            error = wanted[axis] - estimate.vel_ned_m_s[axis]
+            error = wanted_m_s[axis] - estimate.vel_ned_m_s[axis]
             acc.append(VEL_P_1_S * error + self._summed(estimate, axis, VEL_I_1_S2, 2.0, error=error, dt_s=dt_s))
-        acc_n, acc_e = limited(acc[0], acc[1], ACC_MAX_M_S2)
-        return self._aim(estimate, acc_n, acc_e, self._acc_down(estimate, speed_z_m_s, dt_s), dt_s=dt_s)
+        return acc[0], acc[1]
 
     def _acc_down(self, estimate: Estimate, speed_z_m_s: float, dt_s: float) -> float:
         error = speed_z_m_s - estimate.vel_ned_m_s[2]
