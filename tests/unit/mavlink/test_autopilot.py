@@ -267,13 +267,19 @@ def test_a_mode_that_came_and_went_between_two_polls_is_shown_once(custom_mode: 
     assert bench.pilot.watch.departures == 1
 
 
-def changed_to_offboard() -> Bench:
-    """A vehicle that has told its change to OFFBOARD, and 60 ms later tells HOLD in a HEARTBEAT."""
+def told(custom: int, mode: FlightMode, ago_s: float) -> Bench:
+    """A vehicle that told HOLD in a HEARTBEAT, and so long ago a mode in a CURRENT_MODE."""
     bench = Bench().ready()
     bench.heartbeat(PX4_HOLD)
     flying(bench, 1.0, mode_hz=0.0)
-    bench.say(dialect.MAVLink_current_mode_message(0, PX4_OFFBOARD, 0))
-    assert flying(bench, 0.06, mode_hz=0.0).mode is FlightMode.EXTERNAL
+    bench.say(dialect.MAVLink_current_mode_message(0, custom, 0))
+    assert flying(bench, ago_s, mode_hz=0.0).mode is mode
+    return bench
+
+
+def changed_to_offboard() -> Bench:
+    """A vehicle that has told its change to OFFBOARD, and 60 ms later tells HOLD in a HEARTBEAT."""
+    bench = told(PX4_OFFBOARD, FlightMode.EXTERNAL, 0.06)
     bench.heartbeat(PX4_HOLD)
     assert flying(bench, 0.1, mode_hz=0.0) is None, "in doubt: nothing is sent"
     return bench
@@ -297,11 +303,7 @@ def test_a_pilot_who_takes_over_right_after_a_change_of_mode_is_believed_with_th
 
 def test_a_change_that_a_heartbeat_and_a_mode_tell_at_once_is_believed() -> None:
     """The mode before was told 0.1 s ago, so that the first of both contradicts it; a tick stamps them alike."""
-    bench = Bench().ready()
-    bench.heartbeat(PX4_HOLD)
-    flying(bench, 1.0, mode_hz=0.0)
-    bench.say(dialect.MAVLink_current_mode_message(0, PX4_HOLD, 0))
-    assert flying(bench, 0.1, mode_hz=0.0).mode is FlightMode.HOLD
+    bench = told(PX4_HOLD, FlightMode.HOLD, 0.1)
     bench.heartbeat(PX4_OFFBOARD)
     bench.say(dialect.MAVLink_current_mode_message(0, PX4_OFFBOARD, 0))
     assert bench.poll().mode is FlightMode.EXTERNAL
