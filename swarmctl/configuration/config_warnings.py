@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from swarmctl.config import Config
+from swarmctl.configuration.constraints import is_tick
 from swarmctl.control.reference.kinds.csv_table import CsvParams
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.text import point_text
@@ -21,7 +22,6 @@ _PLANNERS = ("mpc", "dmpc", "dmpc3")  # controllers that are bounded by u_max
 _BEHIND_M = 0.5  # by acceleration that is lacking: short peaks cost less
 _SAME_M = 1e-6  # distances that differ by less are the same but for rounding
 _STEEP_RAD = 0.75  # a real PX4 has yawed at 44 degrees, and had no thrust left at 55
-_SAME_TICK = 1e-3  # share by which two times between ticks may differ
 _ZERO = np.zeros(1)
 
 
@@ -31,8 +31,7 @@ def config_warnings(config: Config) -> list[str]:
     kind = config.mission.kind
     found = [f"mission.{name} is set, mission.kind is {kind!r}: it is not flown" for name in unused]
     references = config.mission.references(np.array(config.starts_ned_m()), config.separation.budget.planned_m)
-    flown = (*_begin_elsewhere(config, references), *_left_behind(config, references))
-    flown = (*flown, *_seen_too_late(config, references))
+    flown = [text for about in (_begin_elsewhere, _left_behind, _seen_too_late) for text in about(config, references)]
     judged = (*_judged_by_more_than_is_kept(config), *_stand_above_each_other(config))
     return [*found, *flown, *judged, *_turned_by_steep_tilt(config), *_counts_by_other_ticks(config)]
 
@@ -160,6 +159,6 @@ def _turned_by_steep_tilt(config: Config) -> Iterator[str]:
 def _counts_by_other_ticks(config: Config) -> Iterator[str]:
     """Yield that an own controller, asked once a tick, would take its plan's step for the time between two ticks."""
     dt_s, tick_s = config.controller.mpc.dt_s, 1.0 / config.agent.rate_hz
-    if config.controller.is_own and abs(dt_s - tick_s) > _SAME_TICK * tick_s:
+    if config.controller.is_own and not is_tick(dt_s, config.agent.rate_hz):
         asked = f"agent.rate_hz = {config.agent.rate_hz:g}: {config.controller.kind} is asked every {tick_s:.4g} s"
         yield f"{asked}, and its dt_s is controller.mpc.dt_s = {dt_s:g}: integrals and differences by that are off"

@@ -25,7 +25,7 @@ from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.transport import Endpoint, parse_url
 
 _PAIRS_SHOWN = 3
-_SAME_TICK = 1e-3  # share by which a PID's time between two ticks may be off
+_SAME_TICK = 1e-3  # share by which two times between ticks may differ
 _HEARTBEATS = 4  # within the time after which a peer counts as silent: three may be missed in succession
 _LEAST_FAR_COMMITTED_HZ = 2.0  # a round trip, one message of it lost, lasts less than a lease
 _LEAST_FAR_HZ = 0.5  # two seconds, in which two vehicles may have come ten metres closer
@@ -44,10 +44,15 @@ def own_controller_problems(
         )
 
 
+def is_tick(dt_s: float, rate_hz: float) -> bool:
+    """Return whether a time is that between two ticks of an agent."""
+    return abs(dt_s * rate_hz - 1.0) <= _SAME_TICK
+
+
 def tick_problems(controller: ControllerParams, rate_hz: float) -> Iterator[str]:
     """Yield that the PID would take ticks to be longer or shorter than they are."""
     dt_s, tick_s = controller.section(PidParams).dt_s, 1.0 / rate_hz
-    if controller.kind == PID.name and abs(dt_s - tick_s) > _SAME_TICK * tick_s:
+    if controller.kind == PID.name and not is_tick(dt_s, rate_hz):
         ticks = f"ticks are {tick_s:.4g} s apart by agent.rate_hz = {rate_hz:g}"
         factor = f"a factor of {max(dt_s / tick_s, tick_s / dt_s):.2g}"
         off = f"its derivative and its integral would be off by {factor}; set it to {tick_s:.6g}"

@@ -124,8 +124,8 @@ class PathPublisher:
             t0_us, dt_us = now_us + self._delay_us, self._dt_us
             if self._is_recent(state):
                 stops, ahead_s = self._stop_judge.update(state), self._ahead_s(t0_us, state.t_us)
-                limits = {"brake_m_s2": self._setup.separation.brake_m_s2, "drag_1_s": self._drag_1_s}
-                pos = predict_flown_by_others(state, ahead_s, stops=stops, **limits)
+                brake_m_s2 = self._setup.separation.brake_m_s2
+                pos = predict_flown_by_others(state, ahead_s, brake_m_s2, stops=stops, drag_1_s=self._drag_1_s)
                 margin_m += 0.0 if stops or not is_steered(state) else STEERED_MARGIN_M
             else:
                 pos, apart_m = self._without_link(state, t0_us)
@@ -150,10 +150,9 @@ class PathPublisher:
         """
         keeps_s, coasts_s = self._ports.autopilot.setpoint_loss_s, self._ports.autopilot.landing_delay_s
         assert keeps_s is not None and coasts_s is not None
-        limits = {"keeps_s": keeps_s, "coasts_s": coasts_s, "brake_m_s2": self._setup.separation.brake_m_s2}
-        limits["drag_1_s"] = self._drag_1_s
-        ahead_s = self._ahead_s(t0_us, state.t_us)
-        deaf = predict_without_setpoints(state, ahead_s, **limits)
+        brake_m_s2, drag_1_s = self._setup.separation.brake_m_s2, self._drag_1_s
+        limits = {"keeps_s": keeps_s, "coasts_s": coasts_s, "brake_m_s2": brake_m_s2, "drag_1_s": drag_1_s}
+        deaf = predict_without_setpoints(state, self._ahead_s(t0_us, state.t_us), **limits)
         if self._flown is None or self._flown[1] <= state.t_us:
             return deaf, 0.0
         plan, last_us = self._flown

@@ -10,12 +10,12 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, VehicleState
 
+SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
 _MOST_NAMED = 4  # agents in one line
 LEAST_CLIMB_M = 0.5  # of a configuration
 _REFUSED_CLIMB_M = 0.25  # heights are estimates: a start at the least height must not be refused for a few centimetres
 _STOPPED_US = 3_000_000  # in hold below its height; a PX4 that has climbed goes on rising for a second in it
 _NEAR_M = 1.0  # PX4 ends a climb 0.8 m below its height (NAV_MC_ALT_RAD), and estimates drift
-_SPIN_UP_S = 6.0  # from arming to the climb
 _CLIMBS_M_S = 1.0  # of autopilots, at least
 _TAKES_CONTROL_S = 3.0  # from the end of the climb, or of a hold in it, to the first setpoint
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
@@ -59,7 +59,7 @@ def unmet_climb_condition(inputs: PhaseInputs, state: VehicleState, top_ned_m: A
 def obstacle_coming(inputs: PhaseInputs, state: VehicleState, top_ned_m: Array) -> Obstacle | None:
     """Return an obstacle that moves into the way of a climb to (3,), until the agent has control; None without one."""
     top_z_m = float(top_ned_m[2])
-    spins_up_s = _SPIN_UP_S if state.landed is Landed.ON_GROUND else 0.0
+    spins_up_s = 1e-6 * SPIN_UP_US if state.landed is Landed.ON_GROUND else 0.0
     climbs_s = max(0.0, float(state.pos_ned_m[2]) - top_z_m) / _CLIMBS_M_S
     return inputs.crossing_obstacle(state.pos_ned_m, top_z_m, spins_up_s + climbs_s + _TAKES_CONTROL_S)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from swarmctl.control.phases.arming import ArmingEvidence
 from swarmctl.control.phases.control_mode import control_mode
-from swarmctl.control.phases.departure import Climb
+from swarmctl.control.phases.departure import SPIN_UP_US, Climb
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.interruptions import Interruptions
 from swarmctl.control.phases.landing import Landing
@@ -26,7 +26,6 @@ from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.types import Array, Command, ControlMode, Landed, Mode, Phase, VehicleState
 
 REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
-SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
 PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
 COMPLETED = "completed"  # the outcome of a mission that was flown to its end
 _TAKES_BACK_US = 5_000_000  # from an operator's resume, for which the autopilot may take to follow setpoints again

@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from swarmctl.control.phases.departure import SPIN_UP_US
 from swarmctl.control.phases.interruptions import HoldPoint
-from swarmctl.control.phases.mission_state import SPIN_UP_US, MissionState
+from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.core.operator_verbs import BEGIN, GOTO, MISSION, POINT, SPEED, YAW, Order
 from swarmctl.core.text import point_text
 from swarmctl.core.types import Array, Landed, Phase, VehicleState

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from swarmctl.control.phases import handover
-from swarmctl.control.phases.departure import obstacle_coming, unmet_climb_condition
+from swarmctl.control.phases.departure import SPIN_UP_US, obstacle_coming, unmet_climb_condition
 from swarmctl.control.phases.inputs import PhaseInputs
-from swarmctl.control.phases.mission_state import SPIN_UP_US, MissionState
+from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.control.phases.trajectories import is_at
 from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 

@@ -28,9 +28,8 @@ def standby(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
         mission.airborne = state.landed is Landed.IN_AIR
         if not mission.airborne and (too_low := mission.climb.too_low):
             return mission.refuse(too_low, inputs)
-        mission.patient_from_us = (
-            inputs.now_us
-        )  # the way to the start has its time, however long others were waited for
+        # however long others were waited for, the way to the start has its time:
+        mission.patient_from_us = inputs.now_us
         mission.enter(Phase.ARM, inputs.now_us)
         return []
     stays = state.mode is FlightMode.EXTERNAL and inputs.arm_in is None and not inputs.armable
