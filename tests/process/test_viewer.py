@@ -33,6 +33,7 @@ from swarmctl.wall_clock import monotonic_us
 pytestmark = [pytest.mark.process, pytest.mark.timeout(120)]
 
 AGENTS = 3
+LAUNCHER_WAITS_S = 10.0  # from SIGTERM until it kills the viewer
 RUN = "test"
 OBSTACLE = {"center_ned_m": [2.0, 7.0, -1.5], "radius_m": 1.0, "keep_out_m": 1.75, "visibility_m": 3.0}
 
@@ -113,7 +114,8 @@ def viewer(endpoint: str, directory: Path, *more: str) -> Iterator[subprocess.Po
     flight = json.dumps({"agents": [{}] * AGENTS, "obstacles": [OBSTACLE]})
     command += ["--flight", flight, "--run-dir", str(directory), *more]
     with (directory / "viewer.log").open("wb") as log:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
+        # It gives way to every other test unless the kernel shares the processors by session.
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True)
     try:
         yield process
     finally:
@@ -130,11 +132,9 @@ def ready(process: subprocess.Popen[str]) -> str:
     return line.split()[1]
 
 
-def finish(process: subprocess.Popen[str], limit_s: float = 5.0) -> str:
-    began_s = time.monotonic()
+def finish(process: subprocess.Popen[str]) -> str:
     process.send_signal(signal.SIGTERM)
-    output, _ = process.communicate(timeout=20)
-    assert time.monotonic() - began_s < limit_s
+    output, _ = process.communicate(timeout=LAUNCHER_WAITS_S)
     assert process.returncode == 0
     return output.strip().splitlines()[-1]
 
@@ -151,6 +151,18 @@ def values(directory: Path) -> dict[str, list[Any]]:
         if not chunk.is_static:
             rows += [{name: batch.column(name)[k].as_py() for name in names} for k in range(batch.num_rows)]
     return found
+
+
+def has_footer(directory: Path) -> bool:
+    """Whether the recording has the list of its chunks by which a viewer opens it without reading all of it."""
+    from rerun.chunk import RrdReader
+
+    try:
+        RrdReader(str(directory / "telemetry.rrd")).store()
+    except RuntimeError as error:
+        assert "without footer" in str(error)
+        return False
+    return True
 
 
 def scalars(rows: list[Any]) -> list[list[float]]:
@@ -196,9 +208,9 @@ def test_recording_holds_what_was_published(endpoint: str, tmp_path: Path) -> No
     texts = [row[name][0] for row in found["/events/agent-1"] for name in row if name.endswith("TextLog:text")]
     assert "agent 1: mode REPLAY" in texts
     assert "agent 1: plan refused: solver failed" in texts
-    before = (tmp_path / "telemetry.rrd").stat().st_size
+    assert not has_footer(tmp_path)
     assert optimize_recording(tmp_path)
-    assert (tmp_path / "telemetry.rrd").stat().st_size < before
+    assert has_footer(tmp_path)
     assert len(values(tmp_path)["/world/agent/0"]) == 100
 
 
@@ -357,11 +369,12 @@ def test_frozen_watcher_does_not_hold_up_the_end(endpoint: str, tmp_path: Path) 
             swarm.fly(2.0)
             assert watcher.poll() is None
             watcher.send_signal(signal.SIGSTOP)
-            swarm.fly(1.0)
+            swarm.fly(6.0)  # the server's queues are full after 5 s
             time.sleep(0.3)
-            assert finish(process) == "telemetry lost=0 received=450 malformed=0"
+            assert finish(process) == "telemetry lost=0 received=1200 malformed=0"
         finally:
             watcher.kill()
             watcher.wait(10)
             swarm.session.close()
-    assert len(values(tmp_path)["/world/agent/0"]) == 150
+    assert "Flush timed out" in (tmp_path / "viewer.log").read_text(), "it was held up"
+    assert len(values(tmp_path)["/world/agent/0"]) == 400

@@ -31,7 +31,7 @@ from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_port
 from swarmctl.wall_clock import WallClock
 
 URL_FILE = "viewer.url"
-_EXIT_TIMEOUT_S = 4.0  # longest time from SIGTERM to the exit, whatever hangs
+_EXIT_TIMEOUT_S = 4.0  # longest time from the last drawing to the exit, whatever hangs
 _FLUSH_TIMEOUT_S = 2.0
 _PAGE_LOOK_S = 0.2  # time between two looks whether the page is still served
 _PLOT_PERIOD_S = 0.4  # period of curves; poses are sent at --rate-hz
