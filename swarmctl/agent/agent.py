@@ -129,7 +129,7 @@ class Agent:
     @property
     def finished(self) -> bool:
         """Whether this agent and every peer that is still heard on the bus are done."""
-        return self.done and not self._world_model.has_company(self._ports.clock.utc_us())
+        return self.done and not self._world_model.statuses.has_company(self._ports.clock.utc_us())
 
     @property
     def outcome(self) -> str:
@@ -225,7 +225,7 @@ class Agent:
             deadline_misses=deadline_misses,
             timing=self.timing,
         )
-        self._publisher.publish(record, self._mission, self._world_model.excused)
+        self._publisher.publish(record, self._mission, self._world_model.statuses.excused)
         return record
 
     def _timing(self, began_ns: int, sensed_ns: int, planned_ns: int, sent_ns: int, plan: Plan | None) -> TickTiming:
@@ -334,7 +334,7 @@ class Agent:
             self._ports.commands.request(command)
         if mission.pilot_override:
             self._alerts.put("override", mission.outcome, now_us)
-        self._start_conditions.compare_heights(now_us, state, self._world_model.standing_m)
+        self._start_conditions.compare_heights(now_us, state, self._world_model.statuses.standing_m)
         self._start_conditions.report(now_us)
         self._destination.update(now_us)
         self._mission_end.step(now_us)
@@ -362,8 +362,8 @@ class Agent:
             mode=self._modes.mode,
             unresponsive_peer=directive.unresponsive_peer,
             cut_off=directive.cut_off or self._controller_watch.suspended,
-            peers=self._world_model.peers,
-            excused=self._world_model.excused,
+            peers=self._world_model.statuses.inputs,
+            excused=self._world_model.statuses.excused,
             others_ned_m=others_ned_m,
             obstacles=self._world_model.obstacles.at_rest,
             moving_obstacles=partial(self._world_model.obstacles.moving, utc_us),

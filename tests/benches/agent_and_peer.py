@@ -48,7 +48,15 @@ class Bench:
         separation, vehicle = SeparationParams(), VehicleModelParams()
         params = CommitParams().for_vehicle(vehicle)
         self.world_model = WorldModel(
-            0, [*peers], separation, self.bus, rate_hz=RATE_HZ, note=lambda *_, **__: None, vouchers={}
+            0,
+            [*peers],
+            separation,
+            self.bus,
+            rate_hz=RATE_HZ,
+            note=lambda *_, **__: None,
+            vouchers={},
+            quorum=1,
+            model=vehicle,
         )
         self.coordination = Coordination(
             agent=0,

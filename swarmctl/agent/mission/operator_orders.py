@@ -71,7 +71,7 @@ class OperatorOrders:
         """Believe that a peer has ended; return why not, or ""."""
         life_sign = self._world_model.life_sign(peer, self._ports.clock.utc_us())
         if not life_sign:
-            self._world_model.exclude(peer)
+            self._world_model.statuses.exclude(peer)
         return life_sign
 
     def _offer_mission(self, order: Order, now_us: int) -> str:

@@ -15,7 +15,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.peer_trajectories import PeerTrajectories
 from swarmctl.control.collision.encounters import Encounters
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
+from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, keep_out_of_commitment
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments
@@ -139,10 +139,11 @@ class Coordination:
 
     def _update_membership(self, utc_us: int) -> None:
         peers, membership = self._peer_trajectories, self._membership
-        self._ended = self._world_model.ended
+        self._ended = self._world_model.statuses.ended
         suspected = self._suspected(utc_us)
         told = {agent: message.exclusions for agent, message in peers.newest.items()}
-        came = self._peers - self._world_model.excused  # before the flight; who is started again knows of nobody so
+        # Before the flight; who is started again knows of nobody so.
+        came = self._peers - self._world_model.statuses.excused
         membership.update(suspected, told, self._ended, votes=peers.heard_before_flight >= came)
         said = (membership.exclusions.suspected, membership.exclusions.promised, membership.excluded)
         if said != self._membership_said:
@@ -349,7 +350,7 @@ class Coordination:
         newest, excluded = self._peer_trajectories.newest, self._membership.excluded
         unseen = {agent for agent in excluded & newest.keys() if self._agent in newest[agent].reach.far}
         participants = self._peers - (excluded - unseen) - self._ended
-        return frozenset(agent for agent in participants if self._world_model.uses_commitments(agent))
+        return frozenset(agent for agent in participants if self._world_model.statuses.uses_commitments(agent))
 
     def _absent(self) -> set[int]:
         """Return peers whose liveliness token is not on the bus."""
@@ -375,19 +376,9 @@ class Coordination:
         return f"cut off from {_names(silent)}" if silent else ""
 
     def _ends(self, message: TrajectoryMessage) -> list[KeepOut]:
-        budget = self._separation.budget
+        separation, budget = self._separation, self._separation.budget
         ends = [np.tile(trajectory.pos_ned_m[-1], (2, 1)) for trajectory in message.followed]
-        return [
-            KeepOut(
-                pos_ned_m=end,
-                radius_m=budget.planned_m,
-                hard_min_distance_m=budget.committed_m,
-                any_height=False,
-                priority_id=message.agent,
-                downwash=self._separation.downwash,
-            )
-            for end in ends
-        ]
+        return [keep_out_of_commitment(end, message.agent, separation, budget) for end in ends]
 
     def _others(
         self, t0_utc_us: int, state: VehicleState, phase: Phase, without: Set[int], encounters: Encounters

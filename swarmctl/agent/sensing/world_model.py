@@ -7,16 +7,15 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 
 from swarmctl.agent.sensing.known_obstacles import KnownObstacles
+from swarmctl.agent.sensing.peer_statuses import PeerStatuses
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.json_messages import StatusMessage, decode_status
 from swarmctl.bus.messages.path_messages import stamp_us
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import PeerPaths, peer_verifiers
-from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Presence, ReceivedMessage
-from swarmctl.bus.vouched_ends import VouchedEnds
+from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.refusals import Refusals
+from swarmctl.bus.senders import Presence
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.collision.separation import (
     KeepOuts,
@@ -27,22 +26,14 @@ from swarmctl.control.collision.separation import (
     not_driving_away_m,
     without_setpoints,
 )
-from swarmctl.control.estimation.flown_by_others import CREEP_M_S
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.types import FLOWN_BY_AGENT, Array, FlightMode, Landed, Phase, PredictedPath
+from swarmctl.core.types import Array, Phase, PredictedPath
 
-_COMPANY_US = 10_000_000  # a peer whose last status is older has left
 _SILENT_US = 2_000_000  # ten statuses; who is heard within it has not ended
 _EXPECTED_US = 160_000  # `heartbeat_s` and three ticks; whose path is older may fly another one
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
-_STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
-_DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
-_HOLDS = frozenset((FlightMode.HOLD,))
-_MOVES = frozenset(FlightMode) - _HOLDS
-_FOLLOWS = VehicleModelParams()  # at once, without drag
 
 
 class WorldModel:
@@ -52,7 +43,7 @@ class WorldModel:
         agent: index of this agent.
         peers: indices of the other agents.
         params: distances and ages.
-        bus: source of messages, drained by `listen`.
+        bus: source of messages, drained by `receive`.
         rate_hz: tick rate of every agent.
         vouchers: agents of which each sender may say that they have ended.
         quorum: see `AgentSetup`.
@@ -72,24 +63,28 @@ class WorldModel:
         rate_hz: float,
         note: Callable[..., None],
         vouchers: Mapping[str, Set[int]],
-        quorum: int = 1,
-        model: VehicleModelParams = _FOLLOWS,
+        quorum: int,
+        model: VehicleModelParams,
     ) -> None:
         self._agent, self._params, self._bus, self._note = agent, params, bus, note
-        self._quorum = quorum
+        self._peers, self._quorum = peers, quorum
         self._ends_as = {"lag_s": model.lag_s, "drag_1_s": model.drag_1_s}
         self._budget = params.budget
         self.refusals, self.presence = Refusals(note), Presence(bus)
         self.clocks = PeerClocks(peers, note)
         self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence, clocks=self.clocks)
-        self._verifiers = peer_verifiers(peers, topics.STATUS, rate_hz, self.refusals, presence=self.presence)
+        self.statuses = PeerStatuses(
+            peers,
+            bus,
+            rate_hz=rate_hz,
+            note=note,
+            refusals=self.refusals,
+            presence=self.presence,
+            clocks=self.clocks,
+            vouchers=vouchers,
+        )
         self._orders = Orders(agent, self.refusals)
-        self._ends = VouchedEnds(vouchers)
-        self._excluded: set[int] = set()  # peers of which an operator has said that they have ended
         self._unresponsive_since_us: dict[int, int] = {}
-        self._status: dict[int, StatusMessage] = {}
-        self._status_us: dict[int, int] = {}  # UTC of the newest one's arrival
-        self._ended: frozenset[int] | None = frozenset()  # peers that have; None: to be found out anew
         self.obstacles = KnownObstacles(note)
 
     def receive(self, utc_us: int) -> list[Order]:
@@ -98,13 +93,13 @@ class WorldModel:
         for sender, payload in self._received_paths():
             self.paths.offer(sender, payload, utc_us)
         for sender, payload in self._bus.receive(topics.STATUS):
-            self._take_status(sender, payload, utc_us)
+            self.statuses.take(sender, payload, utc_us)
         for sender, payload in self._bus.receive(topics.OBSTACLES):
             if refusal := self.obstacles.take(payload):
                 self.refusals.add(sender, topics.OBSTACLES.name, refusal, utc_us)
         orders = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
         for sender, payload in self._bus.receive(topics.ENDED):
-            self._take_end(sender, payload, utc_us)
+            self.statuses.take_end(sender, payload, utc_us)
         self._orders.refuse_misdated(utc_us)
         for sender, topic, reason in self._bus.refused():
             self.refusals.add(sender, topic, reason, utc_us)
@@ -117,15 +112,6 @@ class WorldModel:
         far, near = self._bus.receive(topics.FAR_PATH), self._bus.receive(topics.PATH)
         return sorted(far + near, key=lambda item: stamp_us(item[1])) if far else near
 
-    def _take_end(self, sender: str, payload: bytes, utc_us: int) -> None:
-        """Believe who runs a peer's process, and has seen it end; no `life_sign` speaks against that."""
-        ended, refusal = self._ends.take(sender, payload)
-        if refusal:
-            self.refusals.add(sender, topics.ENDED.name, refusal, utc_us)
-        if ended is not None:
-            self._ended = None
-            self._note("peer_ended", agent=ended.agent, boot_id=ended.boot_id, is_down=ended.is_down)
-
     def answer(self, order: Order, refusal: str, comes_to: str = "") -> None:
         """Keep the agent's answer to an order: accepted, and what it comes to, or why it is refused."""
         self._orders.answer(order, refusal, comes_to)
@@ -134,31 +120,13 @@ class WorldModel:
         """Return the answers to operators' orders and their repetitions that are to be sent now."""
         return self._orders.due_answers()
 
-    def _take_status(self, sender: str, payload: bytes, utc_us: int) -> None:
-        status = decode_status(payload)
-        reason = ""
-        if status is None:
-            reason = MALFORMED
-        elif sender != agent_name(status.agent):
-            reason = IDENTITY
-        elif status.agent not in self._verifiers:
-            reason = UNKNOWN_PEER
-        elif max(status.utc_us, status.ready_utc_us) - self.clocks.ahead_us(status.agent) > utc_us + _STATUS_LEAD_US:
-            reason = FUTURE
-        if reason or status is None:
-            self.refusals.add(sender, topics.STATUS.name, reason, utc_us)
-        elif self._verifiers[status.agent].accepts(
-            ReceivedMessage(status.boot_id, status.ticks, status.utc_us, payload), utc_us
-        ):
-            self._status[status.agent], self._status_us[status.agent], self._ended = status, utc_us, None
-
     def _watch_unresponsive(self, utc_us: int) -> None:
         """Report peers that are on the bus but whose paths have not been accepted for too long."""
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
         unresponsive = {
             path.agent: path.t0_utc_us
             for path in self.paths.late(oldest_us)
-            if self._is_there(path.agent) and not self._is_in(path.agent, Phase.DONE)
+            if self._is_there(path.agent) and not self.statuses.is_done(path.agent)
         }
         if not unresponsive and not self._unresponsive_since_us:
             return
@@ -203,8 +171,8 @@ class WorldModel:
                 t0_utc_us,
                 params,
                 budget,
-                parked=self._is_parked(path.agent),
-                landing=descends or self._is_landing(path.agent),
+                parked=self.statuses.is_parked(path.agent),
+                landing=descends or self.statuses.is_landing(path.agent),
                 here_ned_m=pos_ned_m,
                 way=number,
             )
@@ -239,7 +207,7 @@ class WorldModel:
         fresh_us = act_utc_us - round(params.lost_after_s * 1e6)
         found, committed_apart_m = list[Body](), budget.barrier_m(margin_m)
         for agent, trajectories in committed_peers.items():
-            responsibility_01 = 0.5 if self._flies_itself(agent) else 1.0
+            responsibility_01 = 0.5 if self.statuses.flies_itself(agent) else 1.0
             spread_s = 1e-6 * self.clocks.spread_us(agent)
             for pos, vel in (trajectory.at(act_utc_us + ahead_s * 1e6) for trajectory in trajectories):
                 apart_m = committed_apart_m + spread_s * math.hypot(*vel)
@@ -247,9 +215,9 @@ class WorldModel:
         for path in self.paths.near():
             if path.agent in committed_peers:
                 continue
-            filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
+            filters = self.statuses.flies_itself(path.agent) and path.t0_utc_us >= fresh_us
             age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
-            age_margin_m = budget.age_margin_m(age_s, parked=self._is_parked(path.agent))
+            age_margin_m = budget.age_margin_m(age_s, parked=self.statuses.is_parked(path.agent))
             apart_m = budget.barrier_peer_m(margin_m, path.margin_m, age_margin_m)
             least_m = budget.barrier_peer_m(margin_m, path.margin_m, 0.0)
             for way in self._ways(path, act_utc_us):
@@ -264,116 +232,39 @@ class WorldModel:
         seen = self.obstacles.visible(pos_ned_m, act_utc_us)
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in seen.values()]
 
-    def _has_died(self, agent: int) -> bool:
-        """Return whether somebody vouches for the end of a peer's process: its vehicle gets no setpoint any more."""
-        return self._ends.has_ended(agent, self._boot_id(agent))
-
     def _ways(self, path: PredictedPath, utc_us: int) -> tuple[PredictedPath, ...]:
         """Return the paths by which a peer is predicted: its newest, the one without setpoints, or both.
 
         Where its process has ended, the vehicle gets no setpoint. One that is merely silent may fly on as it planned,
         or have stopped: expected in one way alone, others came to 0.17 m of it in the other.
         """
-        agent, status = path.agent, self._status.get(path.agent)
-        if status is None or self._is_parked(agent):
+        agent, boot_id = path.agent, self.statuses.boot_id(path.agent)
+        if boot_id is None or self.statuses.is_parked(agent):
             return (path,)
-        if status.boot_id == path.boot_id and not self._flies_itself(agent):
+        if boot_id == path.boot_id and not self.statuses.flies_itself(agent):
             return (path,)  # as its autopilot or a pilot flies it
-        if self._ends.has_ended(agent, path.boot_id):  # whatever a process says that was started after it
+        if self.statuses.process_has_ended(agent, path.boot_id):  # whatever a process says that was started after it
             return (without_setpoints(path, **self._ends_as),)
         oldest_us = utc_us - _EXPECTED_US
         if path.t0_utc_us >= oldest_us or all(late.agent != agent for late in self.paths.late(oldest_us)):
             return (path,)
         return path, without_setpoints(path, **self._ends_as)
 
-    def exclude(self, agent: int) -> None:
-        """Believe that the process of a peer has ended; another process under its number takes part again."""
-        self._ends.vouch(agent, self._boot_id(agent))
-        self._excluded.add(agent)
-        self._ended = None
-
     def life_sign(self, agent: int, utc_us: int) -> str:
         """Return what speaks against an operator's word that a peer has ended: it was just heard; or "".
 
         Of a peer out of reach only paths are heard.
         """
-        heard_us = max(self._status_us.get(agent, 0), self.paths.newest_utc_us(agent))
+        heard_us = max(self.statuses.heard_us(agent), self.paths.newest_utc_us(agent))
         age_us = max(0, utc_us - heard_us)
-        if self.has_ended(agent) or age_us >= _SILENT_US:
+        if self.statuses.has_ended(agent) or age_us >= _SILENT_US:
             return ""
         return f"{agent_name(agent)} was heard {age_us * 1e-6:.1f} s ago, so it has not ended"
-
-    def has_ended(self, agent: int) -> bool:
-        """Return whether there is evidence that a peer commits to nothing more.
-
-        Somebody vouches for the end of its process, or it was heard done, and sends nothing to its vehicle any more. A
-        missing liveliness token is none: the peer may be cut off.
-        """
-        return self._has_died(agent) or self._is_in(agent, Phase.DONE)
-
-    @property
-    def ended(self) -> frozenset[int]:
-        """Return the peers that have, see `has_ended`."""
-        if self._ended is None:
-            self._ended = frozenset(agent for agent in self._verifiers if self.has_ended(agent))
-        return self._ended
-
-    @property
-    def excused(self) -> frozenset[int]:
-        """Return the peers that nobody waits for: they have never been heard, and an operator has excluded them.
-
-        That a process has ended, as who runs it says, lets nobody take off without it: an operator decides that.
-        """
-        return frozenset(self._excluded - self._status.keys())
-
-    def _boot_id(self, agent: int) -> int | None:
-        status = self._status.get(agent)
-        return None if status is None else status.boot_id
-
-    def uses_commitments(self, agent: int) -> bool:
-        """Return whether a peer flies by commitments; true while its status is unknown."""
-        status = self._status.get(agent)
-        return status is None or status.uses_commitments
-
-    def peers(self) -> dict[int, PeerInputs]:
-        """Return phase, ready time and liveliness of every peer that has published a status."""
-        alive = self._bus.alive()
-        return {
-            agent: PeerInputs(
-                Phase(status.phase), self._ready_utc_us(status), agent_name(agent) in alive, status.keeps_up
-            )
-            for agent, status in self._status.items()
-        }
-
-    def has_company(self, utc_us: int) -> bool:
-        """Return whether some peer is on the bus and not done.
-
-        A liveliness token alone is no proof: one of a computer that was lost may stay for good on a router of another
-        one. So a peer that is silent for long is no company.
-        """
-        since_us = utc_us - _COMPANY_US
-        alive = self._bus.alive()
-        return any(
-            status.phase != Phase.DONE and agent_name(agent) in alive and self._status_us[agent] >= since_us
-            for agent, status in self._status.items()
-        )
-
-    def _ready_utc_us(self, status: StatusMessage) -> int:
-        """Return when a peer reached its start, by the own clock; 0 before."""
-        return status.ready_utc_us - self.clocks.ahead_us(status.agent) if status.ready_utc_us else 0
 
     def others_ned_m(self, utc_us: int) -> tuple[Array, ...]:
         """Return the present position (3,) of each peer by its newest path."""
         paths = self.paths.latest()
         return tuple(aligned(paths, utc_us, 1, 0, brake_m_s2=self._params.brake_m_s2)[:, 0]) if paths else ()
-
-    def standing_m(self) -> dict[int, float]:
-        """Return the heights [m] above the shared origin at which peers' vehicles stand, as their agents have said."""
-        return {
-            agent: status.altitude_m
-            for agent, status in self._status.items()
-            if status.landed == Landed.ON_GROUND and not status.armed and status.ground_speed_m_s >= 0.0
-        }
 
     def has_unresponsive_peer(self, utc_us: int) -> bool:
         """Return whether some peer within reach is silent and not known to be dead: it may fly on, or our bus is lost.
@@ -383,45 +274,13 @@ class WorldModel:
         best effort can know; its path has become a keep-out.
         """
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
-        flying = [p.agent for p in self.paths.near(utc_us - _BUS_LOST_US) if not self.has_ended(p.agent)]
+        flying = [p.agent for p in self.paths.near(utc_us - _BUS_LOST_US) if not self.statuses.has_ended(p.agent)]
         everybody = len(flying) > 1 and utc_us - self.paths.heard_utc_us > _BUS_LOST_US
-        late = [path.agent for path in self.paths.late(oldest_us) if not self.has_ended(path.agent)]
+        late = [path.agent for path in self.paths.late(oldest_us) if not self.statuses.has_ended(path.agent)]
         silent = flying if everybody else late
         if not silent:
             return False
         alive = self._bus.alive()
         if agent_name(self._agent) not in alive or any(agent_name(agent) in alive for agent in silent):
             return True
-        return 1 + sum(agent_name(agent) in alive for agent in self._verifiers) < self._quorum
-
-    def _flies_itself(self, agent: int) -> bool:
-        """Return whether a peer's agent controls its vehicle, and so runs the same safety filter as ours."""
-        status = self._status.get(agent)
-        return status is not None and status.mode in FLOWN_BY_AGENT
-
-    def _is_in(self, agent: int, phase: Phase) -> bool:
-        """Return whether a peer has said that it is in a phase."""
-        status = self._status.get(agent)
-        return status is not None and status.phase == phase
-
-    def _is_parked(self, agent: int) -> bool:
-        """Return whether a peer's mission has ended and its vehicle stays where it is: on the ground, or in a hold.
-
-        An agent that was restarted in flight is done at once, while the autopilot still lands its vehicle. One that
-        was handed back in a hold may be moved in it.
-        """
-        status = self._status.get(agent)
-        if status is None or status.phase != Phase.DONE or self._flies_in(agent, _MOVES):
-            return False
-        return status.ground_speed_m_s < CREEP_M_S or not self._flies_in(agent, _HOLDS)
-
-    def _is_landing(self, agent: int) -> bool:
-        """Return whether a peer's vehicle descends, by its agent's order, a pilot's, or by itself."""
-        return self._is_in(agent, Phase.LAND) or self._flies_in(agent, _DESCENDS)
-
-    def _flies_in(self, agent: int, modes: Set[FlightMode]) -> bool:
-        """Return whether a peer's vehicle flies in one of these modes, as far as its agent has heard."""
-        status = self._status.get(agent)
-        if status is None or not status.armed or status.landed == Landed.ON_GROUND:
-            return False
-        return status.flight_mode in modes
+        return 1 + sum(agent_name(agent) in alive for agent in self._peers) < self._quorum

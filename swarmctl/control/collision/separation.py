@@ -287,6 +287,34 @@ def keep_out_along(
     )
 
 
+def keep_out_of_commitment(
+    points_ned_m: Array,
+    agent: int,
+    params: SeparationParams,
+    budget: SeparationBudget,
+    *,
+    spread_m: float = 0.0,
+    spare_m: float = 0.0,
+) -> KeepOut:
+    """Return the keep-out of a peer on a trajectory that it has committed to.
+
+    Args:
+        points_ned_m: its positions (steps+1, 3) on the own time grid.
+        agent: its number.
+        params, budget: distances; `budget` is that of `params`.
+        spread_m: how far off these points it may be because its clock is not known exactly.
+        spare_m: added to the hard minimum distance.
+    """
+    return KeepOut(
+        pos_ned_m=points_ned_m,
+        radius_m=budget.planned_m + spread_m,
+        hard_min_distance_m=budget.committed_m + spread_m + spare_m,
+        any_height=False,
+        priority_id=agent,
+        downwash=params.downwash,
+    )
+
+
 def not_driving_away_m(wanted_m: float, apart_m: float, least_m: float) -> float:
     """Return a distance to keep from a silent peer that is no larger than the present one, but at least `least_m`."""
     return min(wanted_m, max(apart_m, least_m))

@@ -11,7 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOut, KeepOuts, SeparationParams, certify
+from swarmctl.control.collision.separation import (
+    NO_KEEP_OUTS,
+    KeepOut,
+    KeepOuts,
+    SeparationParams,
+    certify,
+    keep_out_of_commitment,
+)
 from swarmctl.control.commit.commit_params import CommitParams, planning
 from swarmctl.control.commit.situation import Situation, with_run_up
 from swarmctl.control.model import VehicleModelParams
@@ -284,18 +291,11 @@ class TrajectoryPlanner:
     ) -> KeepOuts:
         if not trajectories:
             return NO_KEEP_OUTS
-        budget = self._budget
+        separation, budget = self._separation, self._budget
         spreads_m = [trajectory.spread_m(t0_utc_us) for trajectory in trajectories]
         where = positions_at(trajectories, t0_utc_us + np.arange(steps + 1) * self.dt_us)
         found = [
-            KeepOut(
-                pos_ned_m=points,
-                radius_m=budget.planned_m + spread_m,
-                hard_min_distance_m=budget.committed_m + spread_m + spare_m,
-                any_height=False,
-                priority_id=agent,
-                downwash=self._separation.downwash,
-            )
+            keep_out_of_commitment(points, agent, separation, budget, spread_m=spread_m, spare_m=spare_m)
             for points, agent, spread_m in zip(where, agents, spreads_m, strict=True)
         ]
         return KeepOuts(found, where)

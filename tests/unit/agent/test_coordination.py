@@ -38,7 +38,7 @@ def test_a_missing_token_is_no_evidence_that_a_peer_has_died(bench: Bench) -> No
     bench.fly(5.0)
     assert bench.committed == before, "it may be cut off, and fly on without our acknowledgement"
     assert list(bench.coordination.committed_peers) == [1], "nor is its silence a reason to doubt its commitment"
-    bench.world_model.exclude(1)
+    bench.world_model.statuses.exclude(1)
     bench.fly(0.5)
     assert bench.coordination.committed_peers == {}
     assert bench.committed > before, "somebody vouches that it has ended"
@@ -74,7 +74,7 @@ def test_who_never_came_and_is_excluded_takes_nobodys_vote_away(excludes: bool) 
     """None of the others suspected anybody: of a host that was lost they were cut off, and landed."""
     bench = Bench(peers=(1, 2))
     if excludes:
-        bench.world_model.exclude(2)
+        bench.world_model.statuses.exclude(2)
     bench.fly(1.0, each=bench.send)
     bench.fly(6.0)
     suspects = ("membership", {"suspected": [1], "promised": [], "excluded": []}) in bench.told
@@ -126,7 +126,7 @@ def test_who_has_ended_gets_no_acknowledgement(bench: Bench) -> None:
     bench.proposes = True
     bench.fly(0.5, each=bench.send)
     assert bench.acknowledged == {1: 5}
-    bench.world_model.exclude(1)
+    bench.world_model.statuses.exclude(1)
     bench.fly(0.1, each=bench.send)
     assert bench.acknowledged == {}
 
@@ -135,7 +135,7 @@ def test_the_committed_end_of_a_lost_peer_is_a_keep_out(bench: Bench) -> None:
     """No commitment leads there any more, so an agent that is blocked has to look for a path around it."""
     bench.fly(2.5, each=bench.send)
     assert bench.coordination.lost_peer_keep_outs == []
-    bench.world_model.exclude(1)
+    bench.world_model.statuses.exclude(1)
     bench.fly(0.3)
     (left,) = bench.coordination.lost_peer_keep_outs
     assert left.priority_id == 1
@@ -314,7 +314,7 @@ def test_seldom_messages_to_all_say_each_time_what_was_heard_of_who_is_far(far_h
 def test_a_far_peer_that_has_ended_makes_no_proposal_ask_all(far_bench: Bench, has_ended: bool) -> None:
     far_bench.fly(1.0, each=far_bench.send)
     if has_ended:
-        far_bench.world_model.exclude(1)
+        far_bench.world_model.statuses.exclude(1)
     far_bench.fly(2.0)  # its lease ends
     far_bench.peer.receive(topics.FAR_TRAJECTORY)
     far_bench.fly(1.0)

@@ -85,7 +85,7 @@ def test_guaranteed_follows_the_committed_trajectory_and_names_committed_peers(b
 
 def test_guaranteed_names_the_keep_outs_of_lost_peers(bench: Bench) -> None:
     bench.fly(2.5, each=bench.send)
-    bench.world_model.exclude(1)
+    bench.world_model.statuses.exclude(1)
     bench.fly(0.3)
     directive = guaranteed(bench).step(inputs(bench))
     assert [keep_out.priority_id for keep_out in directive.lost_peer_keep_outs] == [1]

@@ -25,6 +25,7 @@ from swarmctl.bus.messages.json_messages import (
 )
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER
@@ -53,7 +54,15 @@ class Bench:
         note = lambda name, **fields: self.events.append({"event": name, **fields})  # noqa: E731
         vouchers = {topics.OPERATOR: {0, 1, 2}, "bravo": {1}}
         self.world_model = WorldModel(
-            0, [1, 2], SeparationParams(), self.bus, rate_hz=50.0, note=note, vouchers=vouchers, quorum=self.quorum
+            0,
+            [1, 2],
+            SeparationParams(),
+            self.bus,
+            rate_hz=50.0,
+            note=note,
+            vouchers=vouchers,
+            quorum=self.quorum,
+            model=VehicleModelParams(),
         )
 
     def tick(self) -> list[str]:
@@ -222,7 +231,7 @@ def test_a_silent_peer_that_has_left_counts_as_dead_where_enough_others_are_ther
     bench.peer.close()
     bench.clock.advance(2_000_000)
     assert bench.world_model.has_unresponsive_peer(bench.clock.utc_us()) is may_fly_on
-    bench.world_model.exclude(1)
+    bench.world_model.statuses.exclude(1)
     assert not bench.world_model.has_unresponsive_peer(bench.clock.utc_us()), "somebody vouches for it"
     others.close()
 
@@ -247,13 +256,13 @@ def test_statuses_are_accepted_like_paths_and_future_ready_times_refused() -> No
         bench.say_status(phase=int(Phase.READY), ready_utc_us=7)
         for _ in range(10):
             bench.tick()
-    ready = bench.world_model.peers()[1]
+    ready = bench.world_model.statuses.inputs()[1]
     assert (ready.phase, ready.ready_utc_us, ready.alive) == (Phase.READY, 7, True)
     bench.say_status(phase=int(Phase.DONE), boot_id=STATUS.boot_id + 1)
     bench.say_status(phase=int(Phase.DONE), ticks=2**62)
     bench.say_status(phase=int(Phase.READY), ready_utc_us=bench.clock.utc_us() + 2_000_000)
     bench.tick()
-    assert bench.world_model.peers()[1] == ready
+    assert bench.world_model.statuses.inputs()[1] == ready
     assert bench.rejected == {"unconfirmed": 2, "future": 1}
 
 
@@ -279,12 +288,12 @@ def test_a_status_under_a_foreign_or_unknown_name_is_refused() -> None:
     bench.operator.publish(topics.STATUS, encode_message(STATUS))
     bench.peer.publish(topics.STATUS, b"?")
     bench.tick()
-    assert bench.world_model.peers() == {}
+    assert bench.world_model.statuses.inputs() == {}
     assert bench.rejected == {"identity": 2, "malformed": 1}
     stranger = bench.hub.connect(agent_name(7))
     stranger.publish(topics.STATUS, encode_message(msgspec.structs.replace(STATUS, agent=7, ready_utc_us=0)))
     bench.tick()
-    assert bench.world_model.peers() == {}
+    assert bench.world_model.statuses.inputs() == {}
     assert bench.rejected == {"identity": 2, "malformed": 1, "unknown_peer": 1}
 
 
@@ -301,17 +310,17 @@ def test_whose_end_is_vouched_for_has_ended_until_another_process_is_heard() -> 
     bench.say_path()
     bench.say_status(phase=int(Phase.TRACK))
     bench.tick()
-    assert not bench.world_model.has_ended(1)
-    bench.world_model.exclude(1)
+    assert not bench.world_model.statuses.has_ended(1)
+    bench.world_model.statuses.exclude(1)
     for _ in range(150):  # it is silent
         bench.tick()
-    assert bench.world_model.has_ended(1)
+    assert bench.world_model.statuses.has_ended(1)
     assert not bench.world_model.has_unresponsive_peer(bench.clock.utc_us()), "nobody waits for it"
     for _ in range(3):
         bench.seq += 1
         bench.say_status(phase=int(Phase.TRACK), boot_id=STATUS.boot_id + 1)
         bench.tick()
-    assert not bench.world_model.has_ended(1)
+    assert not bench.world_model.statuses.has_ended(1)
 
 
 def test_a_path_that_was_just_heard_speaks_against_the_word_that_a_peer_has_ended() -> None:
@@ -337,7 +346,7 @@ def test_a_silent_peer_for_whom_nobody_vouches_has_not_ended() -> None:
     bench.peer.close()
     for _ in range(150):
         bench.tick()
-    assert not bench.world_model.has_ended(1)
+    assert not bench.world_model.statuses.has_ended(1)
 
 
 def test_a_moving_obstacle_is_avoided_where_it_is_now_not_where_it_was_when_it_was_added() -> None:
@@ -433,7 +442,7 @@ def test_only_who_runs_an_agent_says_that_it_has_ended(sender: str, peer: int, b
     bench.hub.carry(sender, topics.ENDED, encode_message(EndedMessage(agent=peer, boot_id=1, is_down=False)))
     bench.hub.carry(sender, topics.ENDED, encode_message(CommandMessage("land", -1, bench.clock.utc_us() + 1)))
     assert bench.tick() == []
-    assert bench.world_model.has_ended(1) is believed
+    assert bench.world_model.statuses.has_ended(1) is believed
     assert bench.world_model.refusals.by_reason == {"malformed": 1, **({} if believed else {"identity": 1})}
 
 
@@ -447,7 +456,7 @@ def test_an_end_that_is_told_again_says_nothing_of_the_next_process() -> None:
             bench.say_status(phase=int(Phase.STANDBY), boot_id=process)
             bench.hub.carry("bravo", topics.ENDED, encode_message(EndedMessage(agent=1, boot_id=told, is_down=False)))
             bench.tick()
-            found.append(bench.world_model.has_ended(1))
+            found.append(bench.world_model.statuses.has_ended(1))
         return found
 
     assert all(ended_while_heard(1, told=1))
@@ -476,7 +485,7 @@ def test_what_an_operator_says_of_a_peer_that_was_just_heard_is_doubted() -> Non
     heard_us = bench.clock.utc_us()
     assert "heard 1.5 s ago, so it has not ended" in bench.world_model.life_sign(1, heard_us + 1_500_000)
     assert bench.world_model.life_sign(1, heard_us + 2_000_000) == ""
-    bench.world_model.exclude(1)  # as a supervisor says that has seen its process end
+    bench.world_model.statuses.exclude(1)  # as a supervisor says that has seen its process end
     assert bench.world_model.life_sign(1, heard_us) == ""
 
 
@@ -485,12 +494,12 @@ def test_who_has_never_been_heard_is_excused_until_it_is_heard() -> None:
     order = CommandMessage(EXCLUDE, -1, bench.clock.utc_us(), {PEER: 1})
     bench.hub.carry(topics.OPERATOR, topics.COMMAND, encode_message(order))
     assert bench.tick() == [EXCLUDE]
-    bench.world_model.exclude(1)  # as the agent obeys
-    assert bench.world_model.excused == {1}
+    bench.world_model.statuses.exclude(1)  # as the agent obeys
+    assert bench.world_model.statuses.excused == {1}
     bench.peer.publish(topics.STATUS, encode_message(builders.status_message(agent=1)))
     bench.tick()
-    assert bench.world_model.excused == set()
-    assert not bench.world_model.has_ended(1), "this is another process than the one that was vouched for"
+    assert bench.world_model.statuses.excused == set()
+    assert not bench.world_model.statuses.has_ended(1), "this is another process than the one that was vouched for"
 
 
 @pytest.mark.parametrize("boot_id", [None, 7])
@@ -500,10 +509,10 @@ def test_who_has_ended_before_it_was_heard_is_waited_for_until_an_operator_exclu
     ended = EndedMessage(agent=1, boot_id=boot_id, is_down=True)
     bench.hub.carry("bravo", topics.ENDED, encode_message(ended))
     bench.tick()
-    assert bench.world_model.has_ended(1)
-    assert bench.world_model.excused == set()
-    bench.world_model.exclude(1)
-    assert bench.world_model.excused == {1}
+    assert bench.world_model.statuses.has_ended(1)
+    assert bench.world_model.statuses.excused == set()
+    bench.world_model.statuses.exclude(1)
+    assert bench.world_model.statuses.excused == {1}
 
 
 def test_who_is_silent_for_long_is_no_company_though_its_token_stays() -> None:
@@ -511,24 +520,24 @@ def test_who_is_silent_for_long_is_no_company_though_its_token_stays() -> None:
     bench = Bench()
     bench.say_status(phase=Phase.TRACK)
     bench.tick()
-    assert bench.world_model.has_company(bench.clock.utc_us())
+    assert bench.world_model.statuses.has_company(bench.clock.utc_us())
     bench.clock.advance(9_000_000)
-    assert bench.world_model.has_company(bench.clock.utc_us())
+    assert bench.world_model.statuses.has_company(bench.clock.utc_us())
     bench.clock.advance(2_000_000)
     assert agent_name(1) in bench.bus.alive()
-    assert not bench.world_model.has_company(bench.clock.utc_us())
+    assert not bench.world_model.statuses.has_company(bench.clock.utc_us())
 
 
 def test_who_is_done_or_has_left_is_no_company() -> None:
     bench = Bench()
     bench.say_status(phase=Phase.DONE)
     bench.tick()
-    assert not bench.world_model.has_company(bench.clock.utc_us())
+    assert not bench.world_model.statuses.has_company(bench.clock.utc_us())
     bench.say_status(phase=Phase.TRACK, ticks=2)
     bench.tick()
-    assert bench.world_model.has_company(bench.clock.utc_us())
+    assert bench.world_model.statuses.has_company(bench.clock.utc_us())
     bench.peer.close()
-    assert not bench.world_model.has_company(bench.clock.utc_us())
+    assert not bench.world_model.statuses.has_company(bench.clock.utc_us())
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,7 @@ from swarmctl.bus.refusals import MISDELIVERED, RefusedMessage
 from swarmctl.bus.relay import RelayingBus, encode_relay
 from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, PATH, RELAY, STATUS, TRAJECTORY, Topic
 from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.trajectory import resting
@@ -111,6 +112,8 @@ class Scene:
             rate_hz=RATE_HZ,
             note=lambda *_, **__: None,
             vouchers=vouchers,
+            quorum=1,
+            model=VehicleModelParams(),
         )
         refusals, presence = self.world.refusals, self.world.presence
         self.trajectories = PeerTrajectories([1, 2], RATE_HZ, refusals, presence, agent=0, clocks=self.world.clocks)
@@ -174,10 +177,10 @@ class Scene:
     def knows(self) -> tuple[object, ...]:
         """Return everything that agent 0 believes of others."""
         obstacles = len(self.world.obstacles.listed)
-        ended = tuple(self.world.has_ended(agent) for agent in (1, 2))
+        ended = tuple(self.world.statuses.has_ended(agent) for agent in (1, 2))
         newest = tuple((m.boot_id, m.seq) for m in self.trajectories.newest.values())
         paths = tuple((path.agent, path.boot_id, path.seq) for path in self.world.paths.latest())
-        statuses = tuple((s.boot_id, s.ticks, s.phase) for s in self.world._status.values())
+        statuses = tuple((s.boot_id, s.ticks, s.phase) for s in self.world.statuses._newest.values())
         return (*self.believed, obstacles, ended, newest, paths, statuses)
 
 

@@ -37,7 +37,8 @@ class Flight:
         """Return the age of the newest status that an agent has of a peer, as its clock tells."""
         flown = self.lockstep.agents[agent]
         assert flown is not None
-        return self.lockstep.clock.utc_us() - flown._world_model._status[peer].utc_us
+        stamp_us: int = flown._world_model.statuses._newest[peer].utc_us
+        return self.lockstep.clock.utc_us() - stamp_us
 
     def ticks(self, agent: int) -> int:
         return len(self.lockstep.logs[agent].rows)

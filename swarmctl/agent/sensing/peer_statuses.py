@@ -1,0 +1,205 @@
+"""What the peers of an agent have said of themselves, and what others vouch for: who flies, lands, stands or has ended.
+
+Each of these asks for evidence. That a liveliness token is missing is none: the peer may be cut off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence, Set
+
+from swarmctl.bus import topics
+from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.messages.json_messages import StatusMessage, decode_status
+from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.peers import peer_verifiers
+from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
+from swarmctl.bus.senders import Presence, ReceivedMessage
+from swarmctl.bus.vouched_ends import VouchedEnds
+from swarmctl.control.estimation.flown_by_others import CREEP_M_S
+from swarmctl.control.phases.inputs import PeerInputs
+from swarmctl.core.types import FLOWN_BY_AGENT, FlightMode, Landed, Phase
+
+_COMPANY_US = 10_000_000  # a peer whose last status is older has left
+_STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
+_DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
+_HOLDS = frozenset((FlightMode.HOLD,))
+_MOVES = frozenset(FlightMode) - _HOLDS
+
+
+class PeerStatuses:
+    """Keeps the newest status of each peer, the ends that were vouched for, and whom an operator has excluded.
+
+    Args:
+        peers: indices of the other agents.
+        bus: tells who is alive.
+        rate_hz: tick rate of every agent.
+        note: receives the event `peer_ended` with the process that has.
+        refusals: receives what is not believed.
+        presence: when each sender came.
+        clocks: of the peers.
+        vouchers: agents of which each sender may say that they have ended.
+    """
+
+    def __init__(
+        self,
+        peers: Sequence[int],
+        bus: Bus,
+        *,
+        rate_hz: float,
+        note: Callable[..., None],
+        refusals: Refusals,
+        presence: Presence,
+        clocks: PeerClocks,
+        vouchers: Mapping[str, Set[int]],
+    ) -> None:
+        self._bus, self._note, self._refusals, self._clocks = bus, note, refusals, clocks
+        self._verifiers = peer_verifiers(peers, topics.STATUS, rate_hz, refusals, presence=presence)
+        self._ends = VouchedEnds(vouchers)
+        self._excluded: set[int] = set()  # peers of which an operator has said that they have ended
+        self._newest: dict[int, StatusMessage] = {}
+        self._heard_us: dict[int, int] = {}  # UTC of the newest one's arrival
+        self._ended: frozenset[int] | None = frozenset()  # peers that have; None: to be found out anew
+
+    def take(self, sender: str, payload: bytes, utc_us: int) -> None:
+        """Keep a status that has arrived, or refuse it."""
+        status = decode_status(payload)
+        reason = ""
+        if status is None:
+            reason = MALFORMED
+        elif sender != agent_name(status.agent):
+            reason = IDENTITY
+        elif status.agent not in self._verifiers:
+            reason = UNKNOWN_PEER
+        elif max(status.utc_us, status.ready_utc_us) - self._clocks.ahead_us(status.agent) > utc_us + _STATUS_LEAD_US:
+            reason = FUTURE
+        if reason or status is None:
+            self._refusals.add(sender, topics.STATUS.name, reason, utc_us)
+        elif self._verifiers[status.agent].accepts(
+            ReceivedMessage(status.boot_id, status.ticks, status.utc_us, payload), utc_us
+        ):
+            self._newest[status.agent], self._heard_us[status.agent], self._ended = status, utc_us, None
+
+    def take_end(self, sender: str, payload: bytes, utc_us: int) -> None:
+        """Believe who runs a peer's process, and has seen it end, however recently the peer was heard."""
+        ended, refusal = self._ends.take(sender, payload)
+        if refusal:
+            self._refusals.add(sender, topics.ENDED.name, refusal, utc_us)
+        if ended is not None:
+            self._ended = None
+            self._note("peer_ended", agent=ended.agent, boot_id=ended.boot_id, is_down=ended.is_down)
+
+    def exclude(self, agent: int) -> None:
+        """Believe that the process of a peer has ended; another process under its number takes part again."""
+        self._ends.vouch(agent, self.boot_id(agent))
+        self._excluded.add(agent)
+        self._ended = None
+
+    def heard_us(self, agent: int) -> int:
+        """Return the UTC at which the newest status of a peer has arrived; 0 without one."""
+        return self._heard_us.get(agent, 0)
+
+    def boot_id(self, agent: int) -> int | None:
+        """Return the boot id of a peer's process; None of one that has not been heard."""
+        status = self._newest.get(agent)
+        return None if status is None else status.boot_id
+
+    def process_has_ended(self, agent: int, boot_id: int | None) -> bool:
+        """Return whether somebody vouches for the end of this process: its vehicle gets no more setpoints from it."""
+        return self._ends.has_ended(agent, boot_id)
+
+    def has_ended(self, agent: int) -> bool:
+        """Return whether there is evidence that a peer commits to nothing more.
+
+        Somebody vouches for the end of its process, or it was heard done, and sends nothing to its vehicle any more.
+        """
+        return self.process_has_ended(agent, self.boot_id(agent)) or self._is_in(agent, Phase.DONE)
+
+    @property
+    def ended(self) -> frozenset[int]:
+        """Return the peers that have, see `has_ended`."""
+        if self._ended is None:
+            self._ended = frozenset(agent for agent in self._verifiers if self.has_ended(agent))
+        return self._ended
+
+    @property
+    def excused(self) -> frozenset[int]:
+        """Return the peers that nobody waits for: they have never been heard, and an operator has excluded them.
+
+        That a process has ended, as who runs it says, lets nobody take off without it: an operator decides that.
+        """
+        return frozenset(self._excluded - self._newest.keys())
+
+    def is_done(self, agent: int) -> bool:
+        """Return whether a peer has said that its mission has ended."""
+        return self._is_in(agent, Phase.DONE)
+
+    def uses_commitments(self, agent: int) -> bool:
+        """Return whether a peer flies by commitments; true while its status is unknown."""
+        status = self._newest.get(agent)
+        return status is None or status.uses_commitments
+
+    def inputs(self) -> dict[int, PeerInputs]:
+        """Return phase, ready time by the own clock, and liveliness of every peer that has published a status."""
+        alive = self._bus.alive()
+        return {
+            agent: PeerInputs(
+                Phase(status.phase), self._ready_utc_us(status), agent_name(agent) in alive, status.keeps_up
+            )
+            for agent, status in self._newest.items()
+        }
+
+    def _ready_utc_us(self, status: StatusMessage) -> int:
+        """Return when a peer reached its start, by the own clock; 0 before."""
+        return status.ready_utc_us - self._clocks.ahead_us(status.agent) if status.ready_utc_us else 0
+
+    def has_company(self, utc_us: int) -> bool:
+        """Return whether some peer is on the bus and not done.
+
+        A liveliness token alone is no proof: one of a computer that was lost may stay for good on a router of another
+        one. So a peer that is silent for long is no company.
+        """
+        since_us = utc_us - _COMPANY_US
+        alive = self._bus.alive()
+        return any(
+            status.phase != Phase.DONE and agent_name(agent) in alive and self._heard_us[agent] >= since_us
+            for agent, status in self._newest.items()
+        )
+
+    def standing_m(self) -> dict[int, float]:
+        """Return the heights [m] above the shared origin at which peers' vehicles stand, as their agents have said."""
+        return {
+            agent: status.altitude_m
+            for agent, status in self._newest.items()
+            if status.landed == Landed.ON_GROUND and not status.armed and status.ground_speed_m_s >= 0.0
+        }
+
+    def flies_itself(self, agent: int) -> bool:
+        """Return whether a peer's agent controls its vehicle, and so runs the same safety filter as ours."""
+        status = self._newest.get(agent)
+        return status is not None and status.mode in FLOWN_BY_AGENT
+
+    def is_parked(self, agent: int) -> bool:
+        """Return whether a peer's mission has ended and its vehicle stays where it is: on the ground, or in a hold.
+
+        An agent that was restarted in flight is done at once, while the autopilot still lands its vehicle. One that
+        was handed back in a hold may be moved in it.
+        """
+        status = self._newest.get(agent)
+        if status is None or status.phase != Phase.DONE or self._flies_in(agent, _MOVES):
+            return False
+        return status.ground_speed_m_s < CREEP_M_S or not self._flies_in(agent, _HOLDS)
+
+    def is_landing(self, agent: int) -> bool:
+        """Return whether a peer's vehicle descends, by its agent's order, a pilot's, or by itself."""
+        return self._is_in(agent, Phase.LAND) or self._flies_in(agent, _DESCENDS)
+
+    def _is_in(self, agent: int, phase: Phase) -> bool:
+        status = self._newest.get(agent)
+        return status is not None and status.phase == phase
+
+    def _flies_in(self, agent: int, modes: Set[FlightMode]) -> bool:
+        """Return whether a peer's vehicle flies in one of these modes, as far as its agent has heard."""
+        status = self._newest.get(agent)
+        if status is None or not status.armed or status.landed == Landed.ON_GROUND:
+            return False
+        return status.flight_mode in modes
