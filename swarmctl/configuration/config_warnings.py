@@ -18,7 +18,6 @@ from swarmctl.core.types import Array
 _BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
 _SHOWN = 3
 _SAMPLES = 2000  # of a mission
-_PLANNERS = ("mpc", "dmpc", "dmpc3")  # controllers that are bounded by u_max
 _BEHIND_M = 0.5  # by acceleration that is lacking: short peaks cost less
 _SAME_M = 1e-6  # distances that differ by less are the same but for rounding
 _STEEP_RAD = 0.75  # a real PX4 has yawed at 44 degrees, and had no thrust left at 55
@@ -77,10 +76,12 @@ def _begin_elsewhere(config: Config, references: Sequence[MissionReference]) -> 
 
 def _left_behind(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
     """Yield whose reference accelerates for longer than the controller may tilt for, although the vehicle could."""
+    if not config.controller.plans and config.separation.mode != "guaranteed":
+        return  # `u_max` bounds nothing that is flown
     mpc, t_s = config.controller.mpc, np.linspace(0.0, config.mission.duration_s, _SAMPLES)[:-1]  # then it may end
     for agent, reference in enumerate(references):
         model = config.model_of(agent)
-        if reference.jumps or config.controller.kind not in _PLANNERS or mpc.u_max >= model.u_max():
+        if reference.jumps or mpc.u_max >= model.u_max():
             continue
         motion, has_m_s2 = reference.motion(t_s), mpc.accel_max_m_s2(model)
         needed_m_s2 = np.abs(motion.accel_ned_m_s2 + model.drag_1_s * motion.vel_ned_m_s)[:, :2]

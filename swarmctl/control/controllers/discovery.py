@@ -46,7 +46,12 @@ class ControllerParams(Params):
     @property
     def keeps_volume(self) -> bool:
         """Tell whether plans of the controller stay in a flight volume; an own one's are certified to."""
-        return self.is_own or CONTROLLERS[self.kind].keeps_volume
+        return self.is_own or self.plans
+
+    @property
+    def plans(self) -> bool:
+        """Tell whether the controller is one of ours that plan, with the parameters `mpc`."""
+        return not self.is_own and CONTROLLERS[self.kind].plans
 
     @property
     def is_own(self) -> bool:

@@ -44,5 +44,5 @@ class ControllerKind(Generic[P]):
     section: str  # name of the section of the configuration with its parameters, which several may share
     params: type[P]
     make: Callable[[P, ControllerSetup], Controller]
-    keeps_volume: bool = True  # false: it does not plan, and flies out of a flight volume
+    plans: bool = True  # false: `u_max` does not bound it, and it flies out of a flight volume
     follows_reference: bool = True  # false: another one flies to the start and to the landing place

@@ -35,5 +35,5 @@ class OpenLoop:
 
 
 OPEN_LOOP = ControllerKind(
-    name="open_loop", section="mpc", params=MpcParams, make=OpenLoop, keeps_volume=False, follows_reference=False
+    name="open_loop", section="mpc", params=MpcParams, make=OpenLoop, plans=False, follows_reference=False
 )

@@ -98,5 +98,5 @@ class PidController:
 
 
 PID = ControllerKind(
-    name="pid", section="pid", params=PidParams, make=lambda params, _: PidController(params), keeps_volume=False
+    name="pid", section="pid", params=PidParams, make=lambda params, _: PidController(params), plans=False
 )

@@ -66,6 +66,8 @@ def test_a_reference_that_asks_for_more_than_the_controller_may_tilt_is_named() 
     (said,) = lines(fast)
     assert "asks for up to 4.05 m/s2 along an axis, controller.mpc.u_max = 0.2 gives 2.00" in said
     assert lines(fast, "controller.mpc.u_max=0.5") == lines(fast, "controller.kind=pid") == lines() == []
+    guaranteed = 'separation.mode="guaranteed"'  # plans by these parameters under every controller
+    assert any("asks for up to 4.05" in said for said in lines(fast, "controller.kind=pid", guaranteed))
 
 
 def test_an_own_controller_is_told_that_it_is_asked_more_often_than_its_plans_step() -> None:
