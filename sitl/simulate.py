@@ -20,14 +20,12 @@ from rich.progress import Progress
 from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
 from swarmctl.configuration.config_warnings import warning_lines
-from swarmctl.configuration.view import viewed_flight
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
 from swarmctl.files import replace_bytes, write_each
-from swarmctl.ops.flight.summary import summary_lines, unwritten_line, violation_lines
+from swarmctl.ops.flight.summary import draw_recording, summary_lines, unwritten_line, violation_lines
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.file_names import OUTCOME, RECORDING, TRUTH, events_file, ticks_file
-from swarmctl.telemetry.recording.run_files import load_run, read_plans
 from swarmctl.telemetry.recording.run_folder import (
     Outcome,
     create_run_folder,
@@ -35,7 +33,7 @@ from swarmctl.telemetry.recording.run_folder import (
     held_run,
     write_config,
 )
-from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording, simulated_recording
+from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording
 from swarmctl.wall_clock import utc_us
 
 
@@ -82,7 +80,8 @@ def _simulate(config: Config, directory: Path) -> int:
     if gone:
         (directory / OUTCOME).unlink(missing_ok=True)  # of what is left no report can say how it ended
     if not unwritten:
-        _write_recording(config, directory)
+        draw_recording(config, directory)
+        optimize_recording(directory)
     print_line = PlainLines(sys.stdout).print_line  # to a terminal that may have been closed
     for line in (*violation_lines(summary), *summary_lines(summary, directory)):
         print_line(line)
@@ -119,12 +118,6 @@ def _write_rows(flight: Lockstep, directory: Path) -> tuple[str, ...]:
         faults = events_file("sitl")
         writers[faults] = lambda: write_events(directory / faults, flight.fault_events)
     return write_each(writers)
-
-
-def _write_recording(config: Config, directory: Path) -> None:
-    plans = {agent: read_plans(directory, agent) for agent in range(config.swarm.agents)}
-    simulated_recording(directory, load_run(directory), viewed_flight(config), plans)
-    optimize_recording(directory)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -34,6 +34,7 @@ from swarmctl.ops.orders.operator import list_keepers
 from swarmctl.ops.preflight import LOOPBACK, ReservedPorts, inspect
 from swarmctl.ops.processes import (
     ROUTER,
+    VIEWER,
     Child,
     Command,
     RunContext,
@@ -118,7 +119,8 @@ def launch_part(config: Config, options: LaunchOptions, part: SwarmPart) -> int:
 def judged(config: Config, services: Launcher, result: LaunchResult) -> int:
     """Judge the run folder of services that have stopped; return the exit code. Verbs find the launch until then."""
     try:
-        violated = sum_up(config, services.context.directory, result, services.display.print_line)
+        directory, had_viewer = services.context.directory, VIEWER in services.children
+        violated = sum_up(config, directory, result, services.display.print_line, had_viewer=had_viewer)
     finally:
         withdraw()
     return result.exit_code(violated)

@@ -9,6 +9,7 @@ from typing import Any
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.config import Config, load_recorded
+from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.text import printable
 from swarmctl.errors import StartError
 from swarmctl.mavlink.signing.refusals import HARMLESS
@@ -16,19 +17,22 @@ from swarmctl.ops.running_launches import launch_in
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 from swarmctl.telemetry.evaluation.station_clock import corrected_text
+from swarmctl.telemetry.recording.file_names import RECORDING
 
 _LONGEST_NAME = 180  # bytes of a page's name: file systems take 255, of which its temporary name needs some
 _LATE_SHOWN = 5  # agents that are named because a station has not seen their beginning
 _MISSED_SHOWN = 5  # agents that are named because they have not reached their goals
 
 
-def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Callable[[str], None]) -> bool:
+def sum_up(
+    config: Config, directory: Path, result: LaunchResult, print_line: Callable[[str], None], *, had_viewer: bool
+) -> bool:
     """Finish the run folder and print the result; return whether the referee found a violation.
 
-    A folder that can't be read or written is a problem of the run, and never loses the result.
+    A folder that can't be read or written is a problem of the run, and never loses the result. Where there was a
+    viewer that has recorded nothing, which has the processor time that others leave, the recording is drawn now.
     """
-    from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
-    from swarmctl.telemetry.view.recordings import optimize_recording  # heavy
+    from swarmctl.telemetry.recording.run_folder import Outcome, finish_run  # heavy
 
     try:
         outcome = Outcome(outcome=result.outcome, problems=tuple(result.problems))
@@ -45,8 +49,32 @@ def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Ca
     if unwritten:
         result.problems.append(f"run folder: {'; '.join(unwritten)}")
         print_line(unwritten_line(directory, unwritten))
-    optimize_recording(directory)
+    _complete_recording(config, directory, print_line, had_viewer=had_viewer)
     return bool(summary.get("violations"))
+
+
+def _complete_recording(
+    config: Config, directory: Path, print_line: Callable[[str], None], *, had_viewer: bool
+) -> None:
+    from swarmctl.telemetry.view.recordings import optimize_recording  # heavy
+
+    if had_viewer and not (directory / RECORDING).exists():
+        try:
+            draw_recording(config, directory)
+        except Exception as error:  # rerun's, the disk's, or of a folder that somebody has changed
+            print_line(f"no {RECORDING}: the viewer has written none, and it can't be drawn: {error!r}")
+            return
+        print_line(f"{RECORDING}: drawn after the flight, because the viewer has recorded nothing")
+    optimize_recording(directory)
+
+
+def draw_recording(config: Config, directory: Path) -> None:
+    """Write `telemetry.rrd` of a finished run from what its agents have recorded."""
+    from swarmctl.telemetry.recording.run_files import load_run, read_plans  # heavy
+    from swarmctl.telemetry.view.recordings import simulated_recording
+
+    plans = {agent: read_plans(directory, agent) for agent in range(config.swarm.agents)}
+    simulated_recording(directory, load_run(directory), viewed_flight(config), plans)
 
 
 def unwritten_line(directory: Path, unwritten: Sequence[str], gone: Sequence[str] = ()) -> str:

@@ -111,7 +111,7 @@ def test_a_launch_is_ending_from_the_end_of_its_agents_until_its_report_is_writt
 ) -> None:
     order: list[str] = []
 
-    def ended(*given: object) -> bool:
+    def ended(*given: object, **_: bool) -> bool:
         try:
             order.append(find_launch(launch.run_dir).run)
         except StartError as error:

@@ -23,11 +23,11 @@ from pathlib import Path
 from swarmctl.config import Config
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.ops.flight.summary import sum_up
-directory, limit = Path(sys.argv[1]), int(sys.argv[2])
+directory, limit, had_viewer = Path(sys.argv[1]), int(sys.argv[2]), len(sys.argv) > 3
 if limit >= 0:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 result = LaunchResult(problems=["agent-1 was killed by SIGKILL", "agent-2 has been silent for 5 s"])
-violated = sum_up(Config(), directory, result, print)
+violated = sum_up(Config(), directory, result, print, had_viewer=had_viewer)
 print("exit code", result.exit_code(violated))
 """
 
@@ -40,8 +40,8 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def sum_up(folder: Path, limit: int) -> list[str]:
-    command = [sys.executable, "-c", _SUM_UP, str(folder), str(limit)]
+def sum_up(folder: Path, limit: int, *more: str) -> list[str]:
+    command = [sys.executable, "-c", _SUM_UP, str(folder), str(limit), *more]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.splitlines()
 
 
@@ -94,6 +94,25 @@ def test_a_recording_that_cannot_be_judged_costs_the_figures_and_not_the_verdict
     assert lines[:2] == ["violation: agent-1 was killed by SIGKILL", "violation: agent-2 has been silent for 5 s"]
     assert lines[2].startswith("failed, ")
     assert "can't be judged" in lines[-2]
+    assert lines[-1] == "exit code 4"
+
+
+def test_a_viewer_that_had_no_processor_time_costs_no_recording(folder: Path) -> None:
+    sum_up(folder, -1)
+    assert not (folder / "telemetry.rrd").exists(), "nobody has asked for one"
+    lines = sum_up(folder, -1, "there was a viewer")
+    assert "telemetry.rrd: drawn after the flight, because the viewer has recorded nothing" in lines
+    drawn = (folder / "telemetry.rrd").read_bytes()
+    assert len(drawn) > 100_000
+    lines = sum_up(folder, -1, "there was a viewer")
+    assert not any("drawn" in line for line in lines), "one that is there is kept"
+
+
+def test_a_recording_that_can_not_be_drawn_either_is_told(folder: Path) -> None:
+    lines = sum_up(folder, 30_000, "there was a viewer")
+    assert any(
+        line.startswith("no telemetry.rrd: the viewer has written none, and it can't be drawn") for line in lines
+    )
     assert lines[-1] == "exit code 4"
 
 
