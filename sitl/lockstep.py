@@ -41,7 +41,7 @@ from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.signing_keys import read_keys
 from swarmctl.telemetry.evaluation.referee import RunData
-from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, ticks_file
+from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, received_file, ticks_file
 
 _TAIL_S = 120.0  # time allowed before and after the mission, and beyond what ends by itself
 _TRUTH_EVERY_US = 20_000
@@ -58,6 +58,7 @@ class FlightLog:
     clock: Clock  # the agent's own
     rows: list[NDArray[np.void]] = field(default_factory=list)
     plans: list[bytes] = field(default_factory=list)  # predicted paths, only for a run folder
+    received_rows: list[bytes] = field(default_factory=list)  # likewise
     events: list[dict[str, Any]] = field(default_factory=list)
     _tlog: BinaryIO | None = None
 
@@ -69,6 +70,10 @@ class FlightLog:
         self.rows.append(row)
         if self.directory is not None:
             self.plans.append(plan_rows(row, flown).tobytes())
+
+    def received(self, rows: bytes) -> None:
+        if self.directory is not None:
+            self.received_rows.append(rows)
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         source = agent_name(self.agent)
@@ -96,6 +101,7 @@ class FlightLog:
             self._tlog.close()
         (self.directory / ticks_file(self.agent)).write_bytes(self.ticks.tobytes())
         (self.directory / plans_file(self.agent)).write_bytes(b"".join(self.plans))
+        (self.directory / received_file(self.agent)).write_bytes(b"".join(self.received_rows))
         write_events(self.directory / events_file(agent_name(self.agent)), self.events)
 
 

@@ -25,6 +25,9 @@ class TickSink(Protocol):
     def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
         """Take the row of a tick, a (1,) array of `core.recorded.records.TICK_DTYPE`."""
 
+    def received(self, rows: bytes) -> None:
+        """Take what a tick has received, rows of `core.recorded.received.RECEIVED_DTYPE`."""
+
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None: ...
 
 

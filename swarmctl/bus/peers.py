@@ -61,8 +61,8 @@ class PeerPaths:
         self.refusals = refusals
         self.heard_utc_us = 0
 
-    def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
-        """Check one message of the PATH topic, and keep it if it is accepted.
+    def offer(self, sender: str, payload: bytes, utc_us: int) -> PredictedPath | None:
+        """Check one message of the PATH topic, and keep it if it is accepted; return the path, None if it is refused.
 
         Args:
             sender: name in the key it arrived on, which the bus guarantees.
@@ -72,14 +72,15 @@ class PeerPaths:
         path = self._by_own_clock(decode_path(payload))
         if path is None or (reason := self._refusal(sender, path, utc_us)):
             self.refusals.add(sender, PATH.name, MALFORMED if path is None else reason, utc_us)
-            return
-        if self._verifiers[path.agent].accepts(
-            ReceivedMessage(path.boot_id, path.seq, path.t0_utc_us, payload), utc_us
-        ):
-            is_first = path.agent not in self._newest
-            self._newest[path.agent], self.heard_utc_us, self._near = path, utc_us, None
-            if is_first:
-                self._newest = dict(sorted(self._newest.items()))
+            return None
+        message = ReceivedMessage(path.boot_id, path.seq, path.t0_utc_us, payload)
+        if not self._verifiers[path.agent].accepts(message, utc_us):
+            return None
+        is_first = path.agent not in self._newest
+        self._newest[path.agent], self.heard_utc_us, self._near = path, utc_us, None
+        if is_first:
+            self._newest = dict(sorted(self._newest.items()))
+        return path
 
     def _by_own_clock(self, path: PredictedPath | None) -> PredictedPath | None:
         """Return the path at times of the own clock, with room for the error that is left of the peer's."""

@@ -67,6 +67,25 @@ def test_the_same_agent_decides_the_same_in_every_phase(folder: Path) -> None:
         assert lines_of(agent)[0].startswith(f"agent-{agent.agent}: {agent.compared} ticks")
 
 
+def test_messages_that_come_late_are_known_in_the_tick_that_took_them(tmp_path: Path) -> None:
+    """As in a launch, where they come whenever they come: they were given to the ticks that follow their stamps.
+
+    Peers' statuses come late too, and the rate shows whether it is told that a peer keeps up.
+    """
+    late = ("bus.delay_ms=30", "bus.jitter_ms=80", "bus.loss_01=0.05", "agent.rate_hz=10")
+    simulate(load(None, [*CROSSING, *late]), tmp_path)
+    for agent in decisions_of_run(tmp_path, ()):
+        assert agent.compared > 200
+        assert agent.phases_differ == agent.plans_differ == 0
+        assert agent.tilt_rad["max"] < 1e-3
+        assert not agent.differences
+    for path in tmp_path.glob("*.received.parquet"):
+        path.unlink()
+    differ = [sum(found.ticks for found in agent.differences) for agent in decisions_of_run(tmp_path, ())]
+    assert sum(differ) > 10, "negative control: by stamps alone"
+    assert len([note for note in notes_of_run(tmp_path) if "an older recording" in note]) == 2
+
+
 def test_frames_that_a_tick_reads_after_its_begin_are_known_in_it(folder: Path, tmp_path: Path) -> None:
     """As in a launch, where reading takes time: every frame was given to the next tick, and each decision came late."""
     late = shutil.copytree(folder, tmp_path / "late")

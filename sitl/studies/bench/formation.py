@@ -107,6 +107,9 @@ class _Nowhere:
     def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
         return
 
+    def received(self, rows: bytes) -> None:
+        return
+
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         return
 

@@ -60,8 +60,8 @@ class PeerStatuses:
         self._heard_us: dict[int, int] = {}  # UTC of the newest one's arrival
         self._ended: frozenset[int] | None = frozenset()  # peers that have; None: to be found out anew
 
-    def take(self, sender: str, payload: bytes, utc_us: int) -> None:
-        """Keep a status that has arrived, or refuse it."""
+    def take(self, sender: str, payload: bytes, utc_us: int) -> StatusMessage | None:
+        """Keep a status that has arrived, and return it; None if it is refused."""
         status = decode_status(payload)
         reason = ""
         if status is None:
@@ -74,10 +74,12 @@ class PeerStatuses:
             reason = FUTURE
         if reason or status is None:
             self._refusals.add(sender, topics.STATUS.name, reason, utc_us)
-        elif self._verifiers[status.agent].accepts(
-            ReceivedMessage(status.boot_id, status.ticks, status.utc_us, payload), utc_us
-        ):
-            self._newest[status.agent], self._heard_us[status.agent], self._ended = status, utc_us, None
+            return None
+        message = ReceivedMessage(status.boot_id, status.ticks, status.utc_us, payload)
+        if not self._verifiers[status.agent].accepts(message, utc_us):
+            return None
+        self._newest[status.agent], self._heard_us[status.agent], self._ended = status, utc_us, None
+        return status
 
     def take_end(self, sender: str, payload: bytes, utc_us: int) -> None:
         """Believe who runs a peer's process, and has seen it end, however recently the peer was heard."""

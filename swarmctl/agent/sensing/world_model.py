@@ -10,6 +10,7 @@ from swarmctl.agent.sensing.known_obstacles import KnownObstacles
 from swarmctl.agent.sensing.peer_statuses import PeerStatuses
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
+from swarmctl.bus.messages.json_messages import StatusMessage
 from swarmctl.bus.messages.path_messages import stamp_us
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peer_clocks import PeerClocks
@@ -51,6 +52,9 @@ class WorldModel:
         note: receives the events `refused` (see `Refusals`), `obstacles_changed` with the list as it was received,
             `peer_ended` with the process that has, and `unresponsive`: a peer within reach is on the bus and has
             published no accepted path for `lost_after_s`; also when that ends, with its duration.
+
+    Attributes:
+        accepted: paths and statuses of peers that were received last, for the recording.
     """
 
     def __init__(
@@ -86,14 +90,18 @@ class WorldModel:
         self._orders = Orders(agent, self.refusals)
         self._unresponsive_since_us: dict[int, int] = {}
         self.obstacles = KnownObstacles(note)
+        self.accepted: list[PredictedPath | StatusMessage] = []
 
     def receive(self, utc_us: int) -> list[Order]:
         """Process everything that has arrived; returns the operator's orders to this agent."""
         self.presence.update(utc_us)
+        self.accepted = []
         for sender, payload in self._received_paths():
-            self.paths.offer(sender, payload, utc_us)
+            if path := self.paths.offer(sender, payload, utc_us):
+                self.accepted.append(path)
         for sender, payload in self._bus.receive(topics.STATUS):
-            self.statuses.take(sender, payload, utc_us)
+            if status := self.statuses.take(sender, payload, utc_us):
+                self.accepted.append(status)
         for sender, payload in self._bus.receive(topics.OBSTACLES):
             if refusal := self.obstacles.take(payload):
                 self.refusals.add(sender, topics.OBSTACLES.name, refusal, utc_us)

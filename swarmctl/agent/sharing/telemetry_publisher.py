@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 
 from swarmctl.agent.ports import TickSink
 from swarmctl.agent.tick_results import ControlOutput, PlanningResult
@@ -17,9 +17,10 @@ from swarmctl.control.estimation.disturbance import Estimate
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.core.clock import Clock
 from swarmctl.core.operator_verbs import Answer
+from swarmctl.core.recorded.received import frame_rows, path_row, status_row
 from swarmctl.core.recorded.records import pack_tick, tick_row
 from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
-from swarmctl.core.types import VehicleState
+from swarmctl.core.types import PredictedPath, VehicleState
 from swarmctl.mavlink.vehicle.autopilot import Autopilot
 
 _STATUS_EVERY_US = 200_000
@@ -104,15 +105,34 @@ class TelemetryPublisher:
             timing=timing,
         )
 
-    def publish(self, record: TickRecord, mission: MissionState, without: Collection[int]) -> None:
-        """Hand a record to the sink and the bus, and a status where one is due, with the peers not waited for."""
+    def publish(
+        self,
+        record: TickRecord,
+        mission: MissionState,
+        without: Collection[int],
+        accepted: Sequence[PredictedPath | StatusMessage],
+    ) -> None:
+        """Hand a record to the sink and the bus, and a status where one is due, with the peers not waited for.
+
+        The sink alone is told what the tick has received, `accepted` messages of peers among it.
+        """
         self._recent_ms.append(record.timing.tick_ms)
         row = tick_row(record)
         self._sink.tick(row, record.flown)
+        self._sink.received(self._received(record.t_us, accepted))
         self._bus.publish(topics.TICK, pack_tick(row, record.flown))
         if record.t_us - self._status_us >= _STATUS_EVERY_US:
             self._status_us = record.t_us
             self._bus.publish(topics.STATUS, encode_message(self._status(record, mission, without)))
+
+    def _received(self, t_us: int, accepted: Sequence[PredictedPath | StatusMessage]) -> bytes:
+        rows = frame_rows(t_us, self._agent, self._autopilot.arrived_us)
+        for told in accepted:
+            if isinstance(told, PredictedPath):
+                rows.append(path_row(t_us, told))
+            else:
+                rows.append(status_row(t_us, told.agent, told.ticks, told.utc_us, keeps_up=told.keeps_up))
+        return b"".join(rows)
 
     def answer(self, answer: Answer) -> None:
         """Answer an operator's order."""

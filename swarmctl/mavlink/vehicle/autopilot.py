@@ -72,6 +72,7 @@ class Autopilot:
         pos_accuracy_m: reported horizontal accuracy, 1 sigma; None while unreported.
         states: the newest; `states.count`: how many were received; two readings give the rate.
         received_us: arrival time of the last frame, host clock.
+        arrived_us: arrival time of each frame that the last poll has taken, in order, host clock.
         invalid: number of polls without a state although a sample existed, by reason.
         watch: the vehicle's flight mode and failsafe, and whether they are in doubt.
         setpoints: what it has been sent.
@@ -104,6 +105,7 @@ class Autopilot:
         self.armed, self.armed_told_us = False, -1
         self._texts: deque[AutopilotText] = deque(maxlen=_MOST_TEXTS)
         self.received_us: int | None = None
+        self.arrived_us: list[int] = []
         self.invalid: Counter[str] = Counter()
         self._sync_us = 0
         self._syncs: deque[int] = deque(maxlen=16)  # host times of unanswered TIMESYNC requests [ns]
@@ -155,6 +157,7 @@ class Autopilot:
     def poll(self, now_us: int) -> VehicleState | None:
         """Drain the link and return the newest state; None before the first complete one and while it is in doubt."""
         self.watch.poll(now_us)
+        self.arrived_us = []
         for datagram in self._transport.receive(now_us):
             for frame in frames(datagram.data):
                 self._frame(frame, datagram.t_us)
@@ -217,6 +220,7 @@ class Autopilot:
         self._on_frame(frame)
         self.watch.on_frame(arrived_us)
         self.received_us = arrived_us
+        self.arrived_us.append(arrived_us)
         number = message_id(frame)
         if number in BOOT_READERS and number != _LOCAL_POSITION:
             self.clock.witness(number, BOOT_READERS[number](payload).time_boot_ms * 1000, arrived_us)

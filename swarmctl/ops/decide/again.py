@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,23 +21,14 @@ from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.types import Array, Phase, Plan, PlanStatus
 from swarmctl.errors import ConfigError
 from swarmctl.files import read_file
-from swarmctl.ops.decide.inputs import (
-    RecordedBus,
-    RecordedLink,
-    RecordedTime,
-    begins_utc_us,
-    frames_of,
-    operator_messages,
-    peer_messages,
-)
-from swarmctl.telemetry.evaluation.referee import RunData
+from swarmctl.ops.decide.deliveries import Recording, deliveries
+from swarmctl.ops.decide.inputs import RecordedBus, RecordedLink, RecordedTime, frames_of
 from swarmctl.telemetry.recording.file_names import frames_file
 
 DIFFERS_RAD, DIFFERS_01 = 0.01, 0.01  # attitude and thrust: far more than rounding
 _MOST_TLOG_BYTES = 2**30
 _MERGE_S = 0.5  # differences that are closer in time are one
 _BOOT = 2
-T = TypeVar("T", bound=tuple[Any, ...])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,13 +66,14 @@ class _Rows:
     def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
         self.rows.append(row)
 
+    def received(self, rows: bytes) -> None:
+        """Forget it."""
+
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         """Forget it."""
 
 
-def decide_again(
-    directory: Path, config: Config, run: RunData, plans: Mapping[int, NDArray[np.void]], agent: int
-) -> NDArray[np.void]:
+def decide_again(directory: Path, config: Config, recording: Recording, agent: int) -> NDArray[np.void]:
     """Return the ticks (T,) of an agent that receives what it has received, by a configuration that may be another.
 
     Raises:
@@ -97,8 +89,9 @@ def decide_again(
     if not frames:
         raise ConfigError(str(path), ["holds no frames of a vehicle"])
     clock, link = RecordedTime(), RecordedLink()
-    bus = RecordedBus(frozenset(agent_name(number) for number in run.ticks))
-    sink, rows = _Rows(), run.ticks[agent]
+    ticks = recording.run.ticks
+    bus = RecordedBus(frozenset(agent_name(number) for number in ticks))
+    sink, rows = _Rows(), ticks[agent]
     clock.t_us, clock.utc = int(rows["t_us"][0]), int(rows["utc_us"][0])
     flown = make_agent(
         config,
@@ -111,42 +104,13 @@ def decide_again(
         on_frame=lambda _: None,
         stopwatch_ns=lambda: 0,
     )
-    from_vehicle = _InTime(frames)
-    from_peers = _InTime(peer_messages(config, agent, run.ticks, plans))
-    from_operator = _InTime(operator_messages(config, agent, run.ticks, run.events))
-    begins_us, arrived_us = begins_utc_us(rows).tolist(), _arrived_us(rows).tolist()
-    for row, begin_us, next_us, frames_us in zip(rows, begins_us, [*begins_us[1:], np.inf], arrived_us, strict=True):
-        clock.t_us, clock.utc = int(row["t_us"]), begin_us
-        link.offer([frame for _, frame in from_vehicle.before(next_us)], frames_us)  # stamped when this tick read them
-        for _, topic, sender, payload in (*from_peers.before(begin_us), *from_operator.before(next_us)):
+    for row, delivery in zip(rows, deliveries(config, agent, recording, frames), strict=True):
+        clock.t_us, clock.utc = int(row["t_us"]), delivery.begin_utc_us
+        link.offer(delivery.datagrams)
+        for _, topic, sender, payload in delivery.messages:
             bus.offer(topic, sender, payload)
         flown.tick(clock.t_us, int(row["deadline_misses"]))
     return np.concatenate(sink.rows) if sink.rows else np.zeros(0, TICK_DTYPE)
-
-
-def _arrived_us(rows: NDArray[np.void]) -> NDArray[np.int64]:
-    """Return the times (T,) [us] at which the frames that each tick read had arrived: that of its state, if it is new.
-
-    Frames are stamped when they are read, but wait for a tick for up to 20 ms, by which a state is older.
-    """
-    t_us = rows["t_us"]
-    age_us = np.nan_to_num(rows["state_age_ms"] * 1e3, nan=np.inf)
-    is_new = age_us < np.diff(t_us, prepend=t_us[:1])
-    return np.asarray(t_us - np.where(is_new, age_us, 0.0).round().astype(np.int64))
-
-
-class _InTime(Generic[T]):
-    """Hands out recorded items, whose first element is their UTC [us], as time goes on."""
-
-    def __init__(self, items: Sequence[T]) -> None:
-        self._items, self._next = items, 0
-
-    def before(self, utc_us: float) -> list[T]:
-        """Return the items before a time that have not been handed out."""
-        first = self._next
-        while self._next < len(self._items) and self._items[self._next][0] < utc_us:
-            self._next += 1
-        return list(self._items[first : self._next])
 
 
 def compare(was: NDArray[np.void], now: NDArray[np.void], agent: int) -> Decisions:

@@ -7,7 +7,8 @@ their ticks, orders and lists of obstacles from the events. What the agent sends
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -30,6 +31,7 @@ from swarmctl.control.estimation.flown_by_others import StopJudge, predict_flown
 from swarmctl.control.model import Predictor
 from swarmctl.control.phases.steps.tracking import BEGIN_DELAY_US
 from swarmctl.core.operator_verbs import MISSION, OPERATOR_VERBS
+from swarmctl.core.recorded.received import ReceivedKind
 from swarmctl.core.types import FlightMode, Landed, Phase, PredictedPath, VehicleState
 from swarmctl.mavlink.commands import OWN_COMPID
 from swarmctl.mavlink.transport import Datagram
@@ -66,9 +68,9 @@ class RecordedLink:
     def __init__(self) -> None:
         self._arrived: list[Datagram] = []
 
-    def offer(self, frames: list[bytes], t_us: int) -> None:
-        """Have frames arrive."""
-        self._arrived += [Datagram(t_us, frame) for frame in frames]
+    def offer(self, datagrams: Iterable[Datagram]) -> None:
+        """Have frames arrive, each at its time."""
+        self._arrived += datagrams
 
     def send(self, data: bytes) -> None:
         """Send to nobody."""
@@ -145,9 +147,41 @@ def peer_messages(
     heard: list[Heard] = []
     for peer, rows in ticks.items():
         if peer != agent:
-            heard += _paths(config, peer, rows, plans[peer])
-            heard += _statuses(peer, rows)
+            stamps_us = rows["utc_us"].tolist()
+            paths = zip(stamps_us, _paths(config, peer, rows, plans[peer]), strict=True)
+            heard += [_path_message(config, utc_us, path) for utc_us, path in paths if path is not None]
+            said = np.diff(rows["phase"].astype(int), prepend=-1) != 0
+            heard += map(_status_message, _statuses(peer, rows, said | (rows["seq"] % _STATUS_EVERY == 0)))
     return sorted(heard, key=lambda message: message[0])
+
+
+def received_messages(
+    config: Config,
+    ticks: Mapping[int, NDArray[np.void]],
+    plans: Mapping[int, NDArray[np.void]],
+    received: NDArray[np.void],
+) -> dict[int, list[Heard]]:
+    """Return what peers have said to an agent, by the monotonic time of the tick that received it.
+
+    Args:
+        config, ticks, plans: of the run; what peers say follows from theirs.
+        received: what the agent has received, rows (K,) of `RECEIVED_DTYPE`.
+    """
+    paths: dict[int, dict[int, PredictedPath | None]] = {}
+    statuses: dict[int, dict[int, StatusMessage]] = {}
+    for peer, rows in ticks.items():
+        earlier = (rows["seq"].astype(np.int64) - 1).tolist()  # a path is numbered before its tick is counted
+        paths[peer] = dict(zip(earlier, _paths(config, peer, rows, plans[peer]), strict=True))
+        theirs = received[(received["kind"] == ReceivedKind.STATUS) & (received["sender"] == peer)]
+        statuses[peer] = {said.ticks: said for said in _statuses(peer, rows, np.isin(rows["seq"], theirs["seq"]))}
+    heard: dict[int, list[Heard]] = {}
+    for t_us, kind, sender, seq, stamp_us, margin_m, keeps_up in received.tolist():
+        now = heard.setdefault(t_us, [])
+        if kind == ReceivedKind.PATH and (path := paths.get(sender, {}).get(seq)):
+            now.append(_path_message(config, stamp_us, replace(path, t0_utc_us=stamp_us, margin_m=margin_m)))
+        elif kind == ReceivedKind.STATUS and (status := statuses.get(sender, {}).get(seq)):
+            now.append(_status_message(msgspec.structs.replace(status, keeps_up=bool(keeps_up))))
+    return heard
 
 
 def operator_messages(
@@ -172,15 +206,26 @@ def _obstacles(own: Sequence[Mapping[str, Any]]) -> Iterator[Heard]:
             yield utc_us_of(event), topics.OBSTACLES, OPERATOR, event["listed"].encode(errors="replace")
 
 
-def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np.void]) -> Iterator[Heard]:
-    """Yield the paths of a peer: its plans, or where it has flown none, straight on or to rest."""
+def _status_message(status: StatusMessage) -> Heard:
+    return status.utc_us, topics.STATUS, agent_name(status.agent), encode_message(status)
+
+
+def _path_message(config: Config, utc_us: int, path: PredictedPath) -> Heard:
+    encoded = encode_path(path, compact=config.agent.path_sharing.compact)
+    return utc_us, topics.PATH, agent_name(path.agent), encoded
+
+
+def _paths(
+    config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np.void]
+) -> Iterator[PredictedPath | None]:
+    """Yield the path of a peer at each tick: its plan, or where it has flown none, straight on or to rest."""
     times_us, begins = np.unique(points["t_us"], return_index=True)
     planned = dict(zip(times_us.tolist(), np.split(points, begins[1:]), strict=True)) if len(points) else {}
     like = planned[int(times_us[0])]["at_us"] if planned else np.arange(_COAST_POINTS) * round(_COAST_S * 1e6)
     model = config.model_of(peer)
     delay_us, stop_judge, brake_m_s2 = Predictor(model).delay_us, StopJudge(), config.separation.brake_m_s2
     for row, begin_us in zip(rows, begins_utc_us(rows).tolist(), strict=True):
-        t_us, utc_us = int(row["t_us"]), int(row["utc_us"])
+        t_us = int(row["t_us"])
         if t_us in planned:
             stop_judge.forget()
             at_us, pos = planned[t_us]["at_us"], planned[t_us]["pos_ned_m"].astype(np.float64)
@@ -191,8 +236,9 @@ def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np
             stops = stop_judge.update(state)
             pos = predict_flown_by_others(state, ahead_s, brake_m_s2, stops=stops, drag_1_s=model.drag_1_s)
         else:
+            yield None
             continue
-        path = PredictedPath(
+        yield PredictedPath(
             agent=peer,
             boot_id=_BOOT,
             seq=int(row["seq"]),
@@ -201,8 +247,6 @@ def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np
             margin_m=0.0,
             pos_ned_m=pos,
         )
-        encoded = encode_path(path, compact=config.agent.path_sharing.compact)
-        yield utc_us, topics.PATH, agent_name(peer), encoded
 
 
 def _state(row: NDArray[np.void]) -> VehicleState:
@@ -221,13 +265,12 @@ def _state(row: NDArray[np.void]) -> VehicleState:
     )
 
 
-def _statuses(peer: int, rows: NDArray[np.void]) -> Iterator[Heard]:
-    """Yield what a peer has said of itself five times a second, as far as others use it."""
+def _statuses(peer: int, rows: NDArray[np.void], said: NDArray[np.bool_]) -> Iterator[StatusMessage]:
+    """Yield what a peer has said of itself in the ticks in which it has, as far as others use it."""
     ready_us = _ready_utc_us(rows)
-    said = np.diff(rows["phase"].astype(int), prepend=-1) != 0
-    for row in rows[said | (rows["seq"] % _STATUS_EVERY == 0)]:
+    for row in rows[said]:
         utc_us = int(row["utc_us"])
-        status = StatusMessage(
+        yield StatusMessage(
             agent=peer,
             boot_id=_BOOT,
             sysid=peer + 1,
@@ -261,7 +304,6 @@ def _statuses(peer: int, rows: NDArray[np.void]) -> Iterator[Heard]:
             uses_commitments=False,
             utc_us=utc_us,
         )
-        yield utc_us, topics.STATUS, agent_name(peer), encode_message(status)
 
 
 def _ready_utc_us(rows: NDArray[np.void]) -> int:

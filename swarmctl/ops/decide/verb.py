@@ -15,10 +15,11 @@ from swarmctl.config import load, load_recorded
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.decide.again import Decisions, compare, decide_again
+from swarmctl.ops.decide.deliveries import Recording
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.recording.file_names import CONFIG
-from swarmctl.telemetry.recording.run_files import load_run, read_plans
+from swarmctl.telemetry.recording.run_files import load_run, read_plans, read_received
 
 _SHOWN = 10  # differences of an agent, in text
 
@@ -41,9 +42,13 @@ def decisions_of_run(directory: Path, overrides: Sequence[str]) -> list[Decision
     run = replace(run, ticks=_recorded(run))
     if not run.ticks:
         raise ConfigError(str(directory), ["holds no ticks of an agent, so that there is nothing to decide again"])
-    plans = {agent: read_plans(directory, agent) for agent in run.ticks}
+    recording = Recording(
+        run=run,
+        plans={agent: read_plans(directory, agent) for agent in run.ticks},
+        received={agent: read_received(directory, agent) for agent in run.ticks},
+    )
     return [
-        compare(rows, decide_again(directory, config, run, plans, agent), agent) for agent, rows in run.ticks.items()
+        compare(rows, decide_again(directory, config, recording, agent), agent) for agent, rows in run.ticks.items()
     ]
 
 
@@ -59,7 +64,10 @@ def notes_of_run(directory: Path) -> list[str]:
         rows, name = recorded.get(agent), agent_name(agent)
         if rows is None:
             notes.append(f"{name}: no ticks were recorded; what it has said is not known to the others, nor compared")
-        elif len(flight_rows(rows[-1:])):
+            continue
+        if not len(read_received(directory, agent)):
+            notes.append(f"{name}: an older recording, without what each tick received: it is guessed by stamps")
+        if len(flight_rows(rows[-1:])):
             phase = Phase(int(rows["phase"][-1])).name
             notes.append(f"{name}: its ticks end in {phase}; how others noticed is not replayed: they may differ")
     return notes

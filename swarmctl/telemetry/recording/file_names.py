@@ -12,6 +12,7 @@ OUTCOME = "outcome.json"  # how a run ended; there until everything is written
 TRUTH = "truth.bin"  # while the simulator flies
 PACKED_TICKS = ".parquet"  # of an agent in a finished run; while it flies, .ticks
 PACKED_PLANS = ".plans.parquet"  # likewise; while it flies, .plans
+PACKED_RECEIVED = ".received.parquet"  # likewise; while it flies, .received
 PACKED_TRUTH = "truth.parquet"  # of a finished run
 CONFIG = "config.toml"
 RECORDING = "telemetry.rrd"
@@ -34,6 +35,11 @@ def ticks_file(agent: int) -> str:
 def plans_file(agent: int) -> str:
     """Return the name of the raw points of an agent's predicted paths."""
     return f"{agent_name(agent)}.plans"
+
+
+def received_file(agent: int) -> str:
+    """Return the name of the raw rows of what an agent's ticks have received."""
+    return f"{agent_name(agent)}.received"
 
 
 def frames_file(agent: int) -> str:

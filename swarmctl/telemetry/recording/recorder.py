@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.core.json_safe import to_json
+from swarmctl.core.recorded.received import RECEIVED_DTYPE
 from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, plan_rows
 from swarmctl.core.types import Plan
 from swarmctl.files import hold
-from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, ticks_file
+from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, received_file, ticks_file
 
 _FLUSH_TIMEOUT_S = 0.25
 _QUEUE = 16384  # items; about 20 s of ticks and frames, 4 MB
@@ -35,10 +36,11 @@ _TLOG_STAMP = struct.Struct(">Q")
 
 
 class Recorder:
-    """Writes ticks, predicted paths, MAVLink frames and events of one agent to four files of a run folder.
+    """Writes ticks, predicted paths, MAVLink frames, events and what ticks received to five files of a run folder.
 
     `agent-<i>.ticks` holds raw `TICK_DTYPE` rows, `agent-<i>.plans` raw `PLAN_DTYPE` rows, `agent-<i>.tlog` frames
-    after their UTC [us] (as ground stations write them), `agent-<i>.events.jsonl` one JSON object on each line.
+    after their UTC [us] (as ground stations write them), `agent-<i>.events.jsonl` one JSON object on each line,
+    `agent-<i>.received` raw `RECEIVED_DTYPE` rows.
     """
 
     def __init__(self, directory: Path, agent: int) -> None:
@@ -48,6 +50,7 @@ class Recorder:
             RowFile(directory / frames_file(agent)),
             RowFile(directory / events_file(self._source)),
             RowFile(directory / plans_file(agent), PLAN_DTYPE.itemsize),
+            RowFile(directory / received_file(agent), RECEIVED_DTYPE.itemsize),
         )
         self._queue: deque[tuple[int, bytes]] = deque()
         self._refused = 0  # written by the tick's thread
@@ -66,6 +69,11 @@ class Recorder:
         points = plan_rows(row, flown)
         if len(points):
             self._put(3, points.tobytes())
+
+    def received(self, rows: bytes) -> None:
+        """Record what one tick has received, rows of `RECEIVED_DTYPE`."""
+        if rows:
+            self._put(4, rows)
 
     def frame(self, utc_us: int, frame: bytes) -> None:
         """Record one MAVLink frame, sent or received at `utc_us`."""
@@ -100,7 +108,7 @@ class Recorder:
             file.close()
 
     def _drain(self) -> None:
-        batches: tuple[list[bytes], ...] = ([], [], [], [])
+        batches: tuple[list[bytes], ...] = tuple([] for _ in self._files)
         for _ in range(len(self._queue)):
             file, row = self._queue.popleft()
             batches[file].append(row)

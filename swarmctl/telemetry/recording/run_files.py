@@ -1,9 +1,9 @@
 """Reads and writes the files of a run folder. A folder may come from another person, so its content is validated.
 
-Formats: `agent-<i>.ticks`, `agent-<i>.plans` and `truth.bin` are raw rows of `core.recorded.records`, as they are
-written in flight; `agent-<i>.parquet`, `agent-<i>.plans.parquet` and `truth.parquet` are the same tables with vectors
-expanded to one column per component. A partial last row, left by a killed process, is ignored. Anything but a regular
-file of bounded size and expected content is refused with a reason.
+Formats: `agent-<i>.ticks`, `agent-<i>.plans`, `agent-<i>.received` and `truth.bin` are raw rows of `core.recorded`, as
+they are written in flight; `agent-<i>.parquet`, `agent-<i>.plans.parquet`, `agent-<i>.received.parquet` and
+`truth.parquet` are the same tables with vectors expanded to one column per component. A partial last row, left by a
+killed process, is ignored. Anything but a regular file of bounded size and expected content is refused with a reason.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
+from swarmctl.core.recorded.received import RECEIVED_COLUMNS
 from swarmctl.core.recorded.records import PLAN_COLUMNS, TICK_DTYPE, TRUTH_COLUMNS
 from swarmctl.core.recorded.stored_column import StoredColumn, dtype_of
 from swarmctl.core.recorded.tick_record import COLUMNS
@@ -33,10 +34,12 @@ from swarmctl.telemetry.recording.file_names import (
     EVENTS,
     MAX_EVENTS_BYTES,
     PACKED_PLANS,
+    PACKED_RECEIVED,
     PACKED_TRUTH,
     SUMMARY,
     TRUTH,
     plans_file,
+    received_file,
 )
 from swarmctl.telemetry.recording.summary_file import decode_summary
 from swarmctl.telemetry.recording.tables import VERSION_KEY, plain_table
@@ -76,6 +79,16 @@ def read_plans(directory: Path, agent: int) -> NDArray[np.void]:
     """
     raw = directory / plans_file(agent)
     return _read_raw_or_packed(raw, raw.with_suffix(PACKED_PLANS), PLAN_COLUMNS, clocks=("t_us", "at_us"))
+
+
+def read_received(directory: Path, agent: int) -> NDArray[np.void]:
+    """Return what an agent's ticks have received, (K,) of `RECEIVED_DTYPE`; none where that was not recorded.
+
+    Raises:
+        ConfigError: the file has not the expected content.
+    """
+    raw = directory / received_file(agent)
+    return _read_raw_or_packed(raw, raw.with_suffix(PACKED_RECEIVED), RECEIVED_COLUMNS, clocks=("t_us",))
 
 
 def _read_raw_or_packed(

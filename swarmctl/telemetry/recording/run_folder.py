@@ -15,6 +15,7 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 
 from swarmctl.core.json_safe import to_json
+from swarmctl.core.recorded.received import RECEIVED_COLUMNS, RECEIVED_DTYPE
 from swarmctl.core.recorded.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
@@ -27,6 +28,7 @@ from swarmctl.telemetry.recording.file_names import (
     EVENTS,
     OUTCOME,
     PACKED_PLANS,
+    PACKED_RECEIVED,
     PACKED_TICKS,
     PACKED_TRUTH,
     RECORDING,
@@ -167,6 +169,7 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
         SUMMARY: partial(replace_text, directory / SUMMARY, to_json(summary, indent=2) + "\n"),
         **{path.name: partial(_pack_ticks, path) for path in sorted(directory.glob("agent-*.ticks"))},
         **{path.name: partial(_pack_plans, path) for path in sorted(directory.glob("agent-*.plans"))},
+        **{path.name: partial(_pack_received, path) for path in sorted(directory.glob("agent-*.received"))},
         **{path.name: partial(_pack_truth, path) for path in directory.glob(TRUTH)},
         REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules=rules),
     }
@@ -253,7 +256,7 @@ def _refuse_recorded(directory: Path) -> None:
     Raises:
         StartError: somebody does.
     """
-    for pattern in ("*.ticks", "*.plans", events_file("*"), TRUTH, OUTCOME):
+    for pattern in ("*.ticks", "*.plans", "*.received", events_file("*"), TRUTH, OUTCOME):
         for path in sorted(directory.glob(pattern)):
             if is_held(path):
                 raise StartError(f"{path}: is still written: the run is not over. Wait until its agents have ended")
@@ -337,6 +340,12 @@ def _pack_ticks(path: Path) -> None:
 def _pack_plans(path: Path) -> None:
     """Replace the raw points of an agent's predicted paths by Parquet."""
     write_parquet(path.with_suffix(PACKED_PLANS), read_rows(path, PLAN_DTYPE), PLAN_COLUMNS)
+    path.unlink()
+
+
+def _pack_received(path: Path) -> None:
+    """Replace the raw rows of what an agent's ticks have received by Parquet."""
+    write_parquet(path.with_suffix(PACKED_RECEIVED), read_rows(path, RECEIVED_DTYPE), RECEIVED_COLUMNS)
     path.unlink()
 
 

@@ -43,6 +43,10 @@ class SharedEvents:
         """Record one tick; that is published elsewhere."""
         self._recorder.tick(row, flown)
 
+    def received(self, rows: bytes) -> None:
+        """Record what a tick has received."""
+        self._recorder.received(rows)
+
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         """Record one event and publish it."""
         line = event_line(self._source, name, t_us, utc_us, fields)

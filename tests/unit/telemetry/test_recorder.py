@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from swarmctl.core.recorded.received import frame_rows
 from swarmctl.core.recorded.records import TICK_DTYPE, tick_row
 from swarmctl.core.types import Plan
 from swarmctl.files import is_held
 from swarmctl.telemetry.recording import recorder as recorder_module
 from swarmctl.telemetry.recording.recorder import Recorder
-from swarmctl.telemetry.recording.run_files import load_run, read_plans, read_rows
+from swarmctl.telemetry.recording.run_files import load_run, read_plans, read_received, read_rows
 from tests.benches.tick_records import tick_record
 
 
@@ -34,6 +35,9 @@ def test_round_trip(tmp_path: Path) -> None:
     for seq in range(100):
         recorder.tick(*told(seq))
     recorder.frame(1_780_000_000_000_000, b"\xfdframe")
+    (row,) = frame_rows(20_000, 2, [19_000])
+    for received in (row, b"", row + row):
+        recorder.received(received)
     recorder.event("plan_failed", 5, 6, status="max_iter", gap_m=float("nan"))
     recorder.close(5.0)
     assert recorder.lost == 0
@@ -46,6 +50,7 @@ def test_round_trip(tmp_path: Path) -> None:
     first = points[points["t_us"] == 0]
     np.testing.assert_array_equal(first["pos_ned_m"], plan.pos_ned_m.astype(np.float32))
     assert first["at_us"].tolist() == [plan.t0_us + step * plan.dt_us for step in range(len(plan.pos_ned_m))]
+    assert read_received(tmp_path, 2)["stamp_us"].tolist() == [19_000] * 3
     stamp = (1_780_000_000_000_000).to_bytes(8, "big")
     assert (tmp_path / "agent-2.tlog").read_bytes() == stamp + b"\xfdframe"
     (event,) = [json.loads(line) for line in (tmp_path / "agent-2.events.jsonl").read_text().splitlines()]

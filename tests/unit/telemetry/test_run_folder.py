@@ -17,6 +17,7 @@ from swarmctl import __version__
 from swarmctl.bus.messages.json_messages import first_list
 from swarmctl.config import Config, dump
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.recorded.received import frame_rows, status_row
 from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import ControlMode, FlightMode, Mode, Phase, PlanStatus
@@ -26,7 +27,7 @@ from swarmctl.telemetry.evaluation.referee import Rules
 from swarmctl.telemetry.recording import run_folder
 from swarmctl.telemetry.recording.file_names import OUTCOME
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
-from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
+from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, read_received, write_parquet
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run, write_config
 from swarmctl.telemetry.report.thinning import thin
 from tests.benches.pages import parsed
@@ -133,6 +134,17 @@ def test_predicted_paths_become_parquet(tmp_path: Path) -> None:
     (tmp_path / "agent-1.plans.parquet").write_bytes(b"PAR1")
     with pytest.raises(ConfigError, match=r"agent-1.plans.parquet"):
         read_plans(tmp_path, 1)
+
+
+def test_what_ticks_have_received_becomes_parquet(tmp_path: Path) -> None:
+    write_run(tmp_path, 3, 6.0)
+    rows = b"".join([*frame_rows(20_000, 1, [15_000, 19_000]), status_row(20_000, 2, 7, 9_000, keeps_up=True)])
+    (tmp_path / "agent-1.received").write_bytes(rows)
+    finish_run(tmp_path, RULES, Outcome(outcome="completed"))
+    assert not (tmp_path / "agent-1.received").exists()
+    assert read_received(tmp_path, 1).tobytes() == rows
+    assert len(read_received(tmp_path, 0)) == 0
+    assert sorted(load_run(tmp_path).ticks) == [0, 1, 2], "they are no ticks"
 
 
 def test_raw_true_states_replace_packed_ones(tmp_path: Path) -> None:
