@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -54,6 +55,24 @@ class Sleeping(Straight):
     def _bad(self, problem: Problem) -> Array:
         time.sleep(0.1)
         return super()._bad(problem)
+
+
+class Chattering(Straight):
+    """Asks for 30 degrees more to one side in a tick and to the other in the next one, as a gain too large does."""
+
+    def _bad(self, problem: Problem) -> Array:
+        commands = super()._bad(problem)
+        commands[:, 0] += math.sin(math.radians(30.0)) * np.where((self._ticks + np.arange(self.steps)) % 2, 1.0, -1.0)
+        return commands
+
+
+class Swinging(Chattering):
+    """Changes sides once in a second."""
+
+    def _bad(self, problem: Problem) -> Array:
+        commands = super(Chattering, self)._bad(problem)
+        commands[:, 0] = math.sin(math.radians(15.0)) * (1.0 if self._ticks // 50 % 2 else -1.0)
+        return commands
 
 
 class Meddling(Straight):

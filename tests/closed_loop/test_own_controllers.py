@@ -6,16 +6,19 @@ Two agents change places head-on. Each bad controller flies well until they appr
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
+from swarmctl.control.controllers import guard
 from swarmctl.control.controllers.guard import Guard
 from swarmctl.control.reference.kinds.goto import GotoParams
 from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import ConfigError
+from tests.benches import misbehaving
 from tests.closed_loop.conftest import AT_100_HZ, FINE, ROOT, Flight, closer_than, fly_now
 
 HEAD_ON = (
@@ -103,6 +106,38 @@ def test_controllers_that_fail_are_caught_and_vehicles_brought_to_rest(told: dic
         assert 0 < counts["flown_ticks"] < counts["mission_ticks"], "it flew well for a while"
         ended = said if controller != "Straight" else "completed"
         assert pilot.outcome.startswith(ended), "what is not asked any more ends the mission, and is named"
+
+
+def flown_alone(controller: str, monkeypatch: pytest.MonkeyPatch, until: Callable[[Lockstep], bool]) -> Flight:
+    """Fly a controller that is bad from the first tick on, a way off its reference."""
+    monkeypatch.setattr(misbehaving, "GOOD_TICKS", 0)
+    lone = (FINE, "swarm.agents=1", "sitl.start=air", "mission.duration_s=3")
+    return fly_now(*lone, named(controller), until=until)
+
+
+def largest_tilt_deg(flight: Flight) -> float:
+    q_nb = flight.lockstep.truth["q_nb"].astype(np.float64)
+    return float(np.degrees(np.arccos(1.0 - 2.0 * (q_nb[:, 1] ** 2 + q_nb[:, 2] ** 2))).max())
+
+
+def test_a_controller_that_chatters_turns_no_vehicle_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = flown_alone("Chattering", monkeypatch, is_over_and_at_rest)
+    assert largest_tilt_deg(flight) < np.degrees(flight.config.vehicle_model.tilt_max_rad), "no more than is asked for"
+    why = "controller tests.benches.misbehaving:Chattering tilts to and fro faster than the vehicle follows"
+    assert failures(flight, 0)[-1] == why
+    (outcome,) = flight.outcomes
+    assert outcome.startswith(why), "it is not asked any more"
+
+
+def test_negative_control_flown_it_turns_the_vehicle_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard._Chatter, "refusal", lambda *_: "")
+    flight = flown_alone("Chattering", monkeypatch, Lockstep.mission_is_over)
+    assert largest_tilt_deg(flight) > 60.0
+
+
+def test_negative_control_a_controller_that_swings_is_flown(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = flown_alone("Swinging", monkeypatch, Lockstep.mission_is_over)
+    assert failures(flight, 0) == []
 
 
 @pytest.mark.parametrize(

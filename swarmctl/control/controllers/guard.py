@@ -1,10 +1,10 @@
 """What stands between a controller of somebody else and the vehicle; it can't be switched off.
 
-In every tick the own controller is asked for commands. They are flown only if they are finite, if the motion that they
-give the vehicle by its model, which is computed here, keeps clear of every keep-out, stays in the flight volume and
-above the ground, and if the vehicle can stop behind it. Otherwise the built-in controller plans this tick, by its own
-certificate. A controller that raises, returns something else than commands, or takes too long, again and again, is not
-asked any more, and the mission ends.
+In every tick the own controller is asked for commands. They are flown only if they are finite, if the vehicle can
+follow the changes of their tilt, if the motion that they give the vehicle by its model, which is computed here, keeps
+clear of every keep-out, stays in the flight volume and above the ground, and if the vehicle can stop behind it.
+Otherwise the built-in controller plans this tick, by its own certificate. A controller that raises, returns something
+else than commands, chatters, or takes too long, again and again, is not asked any more, and the mission ends.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from swarmctl.control.controllers.own import OwnController
 from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.rollout import ModelledVehicle
+from swarmctl.control.setpoint import within_tilt
 from swarmctl.core.discovery.own import in_words, raised_at, traced
 from swarmctl.core.text import printable
 from swarmctl.core.trajectory import braking_displacement
@@ -29,6 +30,8 @@ from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes, Reference
 LATE_S = 0.05  # more than two ticks: setpoints have gaps
 LATE_IN_A_ROW = 3  # late plans after which a controller is not asked any more
 BAD_IN_A_ROW = 25  # likewise, without commands: half a second
+_SLEW_1_S = 2.5  # of (u_x, u_y), as of the safety filter: attitudes that change faster for long saturate rotors
+_SWINGS = 2.0  # changes at once, of the largest tilt: from one side to the other
 _GROUND_M = 0.3  # least height of a plan above the place of the take-off, as of references
 _BELOW_M = 0.1  # by which a plan may be lower than a reference that leads there
 _TAIL_POINTS = 30  # of the braking behind a plan
@@ -49,6 +52,7 @@ class Guard:
     def __init__(self, name: str, own: OwnController, fallback: Controller, setup: ControllerSetup) -> None:
         self._name, self._own, self._fallback, self._setup = name, own, fallback, setup
         self._suspended, self._bad, self._late = "", 0, 0
+        self._chatter = _Chatter(setup)
         self._raised_at: set[str] = set()
         self._traceback = ""  # of the newest place, until a plan tells it
 
@@ -71,6 +75,7 @@ class Guard:
         """Let both forget the past, after a handover; what was suspended stays so."""
         self._fallback.reset()
         self._bad = self._late = 0
+        self._chatter.forget()
         if not self._suspended:
             self._called(lambda: self._own.reset())
 
@@ -82,7 +87,7 @@ class Guard:
         commands, failure = self._called(lambda: self._own.commands(_copied(problem)))
         took_s = (self._setup.stopwatch_ns() - began_ns) * 1e-9
         if not failure:
-            failure = self._malformed(commands)
+            failure = self._malformed(commands) or self._chatter.refusal(commands[0], problem.start.t_us)
         self._count(failure, took_s)
         if failure or self._suspended:
             return self._instead(problem, self._suspended or failure)
@@ -179,6 +184,36 @@ class Guard:
         path = plan.pos_ned_m[-1] + braking_displacement(plan.vel_ned_m_s[-1], tail_s, separation.brake_m_s2)
         behind = [_braking(keep_out, tail_s, dt_s, separation) for keep_out in keep_outs]
         return min(certify(plan.pos_ned_m, keep_outs, 1), certify(path, behind, 1))
+
+
+class _Chatter:
+    """Knows whether a vehicle can follow the commands of successive ticks.
+
+    The model that plans are judged by may take attitudes for immediate. A vehicle that is told 30 degrees to and fro in
+    every tick saturates its rotors, loses thrust and turned over in a few seconds. One swing at once is none of that:
+    what is added up is how much faster tilt changes than rotors turn a vehicle for long.
+    """
+
+    def __init__(self, setup: ControllerSetup) -> None:
+        self._setup = setup
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin with any command."""
+        self._last: tuple[Array, int] | None = None
+        self._ahead = 0.0  # change of (u_x, u_y) that the vehicle has yet to follow
+
+    def refusal(self, command: Array, t_us: int) -> str:
+        """Return why the command (3,) of a tick that acts at `t_us` is not flown, or ""."""
+        vehicle = self._setup.vehicle
+        tilt, most = within_tilt(command, vehicle)[:2], _SWINGS * vehicle.u_max()
+        if self._last is not None:
+            was, was_us = self._last
+            change, follows = float(np.linalg.norm(tilt - was)), _SLEW_1_S * (t_us - was_us) * 1e-6
+            # no more is remembered than what a controller that has come to rest makes good in half a second
+            self._ahead = min(most + 0.5 * _SLEW_1_S, max(0.0, self._ahead + change - follows))
+        self._last = tilt, t_us
+        return "tilts to and fro faster than the vehicle follows" if self._ahead > most else ""
 
 
 def _braking(keep_out: KeepOut, tail_s: Array, dt_s: float, separation: SeparationParams) -> KeepOut:

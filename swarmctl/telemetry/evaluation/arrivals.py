@@ -1,17 +1,21 @@
-"""Evaluates whether agents reached the goals of their newest mission, and when they did for good."""
+"""Evaluates whether agents reached the goals of their newest mission, and when, and who has flown away from it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.bus.bus import agent_name
 from swarmctl.core.goal import REACHED_M
 from swarmctl.core.json_safe import finite
 from swarmctl.core.types import Array
 from swarmctl.telemetry.evaluation.tracks import newest_mission, true_positions
+
+_FAR_M = 3.0  # from the reference, beside the room that agents who share it need
 
 
 def reached_goals(
@@ -56,6 +60,35 @@ def _arrival(
     first = int(away[-1]) + 1 if len(away) else 0
     reached_at_s = max(0.0, float(times_s[first])) if first < len(times_s) else None
     return reached_at_s, float(distance_m[-1])
+
+
+def flown_away(
+    ticks: Mapping[int, NDArray[np.void]],
+    truth: NDArray[np.void],
+    events: Sequence[Mapping[str, Any]],
+    apart_m: float,
+) -> Iterator[str]:
+    """Yield which agents an own controller has left far from their references at the end of their missions.
+
+    Without a flight volume nothing else says so: its commands are judged by what they come near to, and by nothing
+    that they leave.
+
+    Args:
+        ticks: rows of TICK_DTYPE by agent.
+        truth: rows of TRUTH_DTYPE, empty without a simulator.
+        events: of all sources; `controller_summary` is of agents with own controllers.
+        apart_m: distance of vehicles, which those that share a reference keep from each other.
+    """
+    most_m = _FAR_M + apart_m * math.sqrt(len(ticks))
+    own = {event.get("source"): event for event in events if event.get("event") == "controller_summary"}
+    for agent, rows in ticks.items():
+        mission, summary = newest_mission(rows), own.get(agent_name(agent))
+        if summary is None:
+            continue
+        error_m = np.linalg.norm(true_positions(mission, truth, agent) - mission["ref_pos_ned_m"], axis=1)
+        known_m = error_m[np.isfinite(error_m)]
+        if len(known_m) and known_m[-1] > most_m:
+            yield f"controller {summary.get('controller')} left agent {agent} {known_m[-1]:.1f} m from its reference"
 
 
 def _set_in_flight(

@@ -20,7 +20,7 @@ from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.json_safe import finite, json_safe
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
-from swarmctl.telemetry.evaluation.arrivals import reached_goals
+from swarmctl.telemetry.evaluation.arrivals import flown_away, reached_goals
 from swarmctl.telemetry.evaluation.crashes import crashes
 from swarmctl.telemetry.evaluation.punctuality import evaluate_timing
 from swarmctl.telemetry.evaluation.reception import refused_peers
@@ -129,6 +129,7 @@ def evaluate(
     violations += _not_a_number(run.truth)
     if outcome == "completed":
         violations += _cut_short(tracked_s, rules, run.events)
+        violations += _shorten(list(flown_away(run.ticks, run.truth, run.events, rules.required_separation_m)))
     summary = {
         "outcome": "failed" if outcome == "completed" and violations else outcome,
         "violations": violations,

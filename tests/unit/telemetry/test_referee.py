@@ -636,6 +636,24 @@ def test_mission_cut_short_is_no_pass() -> None:
     )
 
 
+@pytest.mark.parametrize("has_truth", [False, True])
+def test_a_mission_that_ends_far_from_its_reference_under_an_own_controller_is_no_pass(has_truth: bool) -> None:
+    rules, own = Rules(agents=1, required_separation_m=0.5), {"event": "controller_summary", "source": "agent-0"}
+
+    def violations(left_m: float, *events: dict[str, Any]) -> list[str]:
+        rows, t_s = ticks(20, (0.0, 0.0, 0.0)), np.arange(0, 21, 0.02)
+        rows["pos_ned_m"][:, 0] = rows["mission_t_s"] * left_m / 20.0
+        true = [truth(0, t_s, np.column_stack([t_s * left_m / 20.0, 0 * t_s, 0 * t_s]))] if has_truth else []
+        found: list[str] = evaluate(run({0: rows}, *true, events=events), rules, "completed")["violations"]
+        return found
+
+    assert violations(46.0, own | {"controller": "own:Away"}) == [
+        "controller own:Away left agent 0 46.0 m from its reference"
+    ]
+    assert violations(3.4, own) == []
+    assert violations(46.0) == [], "built-in ones are judged by the figures alone"
+
+
 def test_diverged_truth_is_no_pass() -> None:
     t_s = np.arange(0, 1, 0.1)
     broken = np.where(t_s[:, None] > 0.5, np.nan, np.zeros((10, 3)))
