@@ -380,7 +380,9 @@ class Agent:
         )
 
     def _report_refusals(self, now_us: int) -> None:
-        """Report messages of the bus, and frames of the vehicle, that were refused."""
+        """Report messages of the bus, and frames of the vehicle, that were refused, and clocks that differ."""
+        if apart := self._world_model.clocks.alert:
+            self._alerts.put("clocks", apart, now_us)
         if refused := self._world_model.refusals.alert(self._ports.clock.utc_us()):
             self._alerts.put("bus", refused, now_us)
         self._vehicle_watch.report_refused_frames(now_us)

@@ -221,6 +221,7 @@ def make_telemetry_publisher(
         separation.uses_commitments,
         autopilot=ports.autopilot,
         paths=world_model.paths,
+        lags_us=world_model.statuses.next_lags_us,
         bus=ports.bus,
         clock=ports.clock,
         sink=ports.sink,

@@ -3,7 +3,8 @@
 A message that a peer stamped s, and that arrived at r by the own clock, was under way for a while: the peer is ahead by
 at least s - r. The peer also says when, by its clock, the newest own message arrived: it is ahead by at most that time
 less the own stamp. Both bounds hold whatever the delays are (the four timestamps of RFC 5905, as an interval instead of
-its midpoint); short delays make them tight. Bounds of the last seconds are kept, because clocks drift.
+its midpoint); short delays make them tight. Bounds of the last seconds are kept, because clocks drift. Agents that
+commit say so in every trajectory message, others in their statuses.
 
 What is applied is 0 as long as 0 is possible, and the middle of the interval when what was applied is not: equal clocks
 are never corrected. Its error is at most the width of the interval, which is a round trip.
@@ -13,6 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+
+from swarmctl.bus.bus import agent_name
 
 _WINDOW_US = 5_000_000  # bounds of this window and of the one before are kept
 _DRIFT_US = 2_000  # two clocks drift apart by less in two windows: 200 ppm
@@ -78,11 +81,16 @@ class PeerClocks:
     Args:
         peers: their numbers.
         note: is told `clock_offset` with `agent`, `ahead_s` and the `error_s` it may have, when a correction changes.
+        trusts_equal: whether clocks that may be equal are taken for equal without room for an error.
+
+    Attributes:
+        alert: what the operator has to know of the clock that is farthest off, or "".
     """
 
-    def __init__(self, peers: Iterable[int], note: Callable[..., None]) -> None:
+    def __init__(self, peers: Iterable[int], note: Callable[..., None], *, trusts_equal: bool = False) -> None:
         self._clocks = {agent: _PeerClock() for agent in peers}
-        self._note = note
+        self._note, self._trusts_equal = note, trusts_equal
+        self.alert = ""
 
     def received(self, agent: int, sent_utc_us: int, utc_us: int) -> None:
         """Take in a message that a peer stamped `sent_utc_us`, received now."""
@@ -102,9 +110,11 @@ class PeerClocks:
         return self._clocks[agent].error_us
 
     def spread_us(self, agent: int) -> int:
-        """Return the error to leave room for; 0 while the clock is not measured and so taken for equal."""
+        """Return the error to leave room for; 0 while the clock is taken for equal, as one that is not measured."""
         clock = self._clocks.get(agent)
-        if clock is None or clock.interval_us[0] <= -_UNMEASURED_US or clock.interval_us[1] >= _UNMEASURED_US:
+        if clock is None or (self._trusts_equal and not clock.ahead_us):
+            return 0
+        if clock.interval_us[0] <= -_UNMEASURED_US or clock.interval_us[1] >= _UNMEASURED_US:
             return 0
         return clock.error_us
 
@@ -114,3 +124,12 @@ class PeerClocks:
         if abs(clock.ahead_us - clock.reported_us) > _REPORTED_US:
             clock.reported_us = clock.ahead_us
             self._note("clock_offset", agent=agent, ahead_s=clock.ahead_us / 1e6, error_s=self.error_us(agent) / 1e6)
+            self.alert = self._farthest_off()
+
+    def _farthest_off(self) -> str:
+        agent, clock = max(self._clocks.items(), key=lambda item: abs(item[1].reported_us))
+        off_s = clock.reported_us * 1e-6
+        if abs(clock.reported_us) <= _REPORTED_US:
+            return ""
+        apart = f"clock of {agent_name(agent)} is {abs(off_s):.2f} s {'ahead of' if off_s > 0.0 else 'behind'} this one"
+        return f"{apart}, which is allowed for: set the clocks of the hosts (chrony, PTP)"

@@ -134,6 +134,16 @@ ROWS = tuple(
             "negative_control_by_stamps_as_they_are_agents_touch",
         ),
         (
+            "clocks-apart-best-effort",
+            "the clocks of hosts differ by 0.3 s, in best effort",
+            "both go where they go, at the distance that is planned",
+            8.0,
+            "offsets of clocks are measured on the statuses",
+            "test_clocks_apart.py",
+            "agents_whose_clocks_differ_keep_apart_and_say_by_how_much",
+            "negative_control_by_stamps_as_they_are_agents_come_too_close",
+        ),
+        (
             "all-starved",
             "all agents miss nine of ten deadlines",
             "wider distances, rest far apart, landing",

@@ -5,13 +5,14 @@ Each of these asks for evidence. That a liveliness token is missing is none: the
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Callable, Mapping, Sequence, Set
 
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import StatusMessage, decode_status
 from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import peer_verifiers
+from swarmctl.bus.peers import MAX_LEAD_US, peer_verifiers
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage
 from swarmctl.bus.vouched_ends import VouchedEnds
@@ -20,7 +21,10 @@ from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.types import FLOWN_BY_AGENT, FlightMode, Landed, Phase
 
 _COMPANY_US = 10_000_000  # a peer whose last status is older has left
-_STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
+_HEARD_US = 2_000_000  # whose clock is measured: ten statuses
+_LAGS_TOLD = 8  # in one status, so that its size does not grow with the swarm: 50 peers are told in 1.4 s
+_READY_LEAD_US = 1_000_000  # largest lead of a peer's ready time over its status
+_CLOCK_LEAD_US = 10_000_000  # largest lead of a peer's clock over ours; seals are held to it, too
 _DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
 _HOLDS = frozenset((FlightMode.HOLD,))
 _MOVES = frozenset(FlightMode) - _HOLDS
@@ -30,18 +34,20 @@ class PeerStatuses:
     """Keeps the newest status of each peer, the ends that were vouched for, and whom an operator has excluded.
 
     Args:
+        agent: index of this agent.
         peers: indices of the other agents.
         bus: tells who is alive.
         rate_hz: tick rate of every agent.
         note: receives the event `peer_ended` with the process that has.
         refusals: receives what is not believed.
         presence: when each sender came.
-        clocks: of the peers.
+        clocks: of the peers; is told what statuses say of them.
         vouchers: agents of which each sender may say that they have ended.
     """
 
     def __init__(
         self,
+        agent: int,
         peers: Sequence[int],
         bus: Bus,
         *,
@@ -52,13 +58,14 @@ class PeerStatuses:
         clocks: PeerClocks,
         vouchers: Mapping[str, Set[int]],
     ) -> None:
-        self._bus, self._note, self._refusals, self._clocks = bus, note, refusals, clocks
+        self._agent, self._bus, self._note, self._refusals, self._clocks = agent, bus, note, refusals, clocks
         self._verifiers = peer_verifiers(peers, topics.STATUS, rate_hz, refusals, presence=presence)
         self._ends = VouchedEnds(vouchers)
         self._excluded: set[int] = set()  # peers of which an operator has said that they have ended
         self._newest: dict[int, StatusMessage] = {}
         self._heard_us: dict[int, int] = {}  # UTC of the newest one's arrival
         self._ended: frozenset[int] | None = frozenset()  # peers that have; None: to be found out anew
+        self._lag_told = -1  # peer whose lag was told last
 
     def take(self, sender: str, payload: bytes, utc_us: int) -> StatusMessage | None:
         """Keep a status that has arrived, and return it; None if it is refused."""
@@ -70,16 +77,38 @@ class PeerStatuses:
             reason = IDENTITY
         elif status.agent not in self._verifiers:
             reason = UNKNOWN_PEER
-        elif max(status.utc_us, status.ready_utc_us) - self._clocks.ahead_us(status.agent) > utc_us + _STATUS_LEAD_US:
+        elif status.ready_utc_us > status.utc_us + _READY_LEAD_US or self._is_far_ahead(status, utc_us):
             reason = FUTURE
         if reason or status is None:
             self._refusals.add(sender, topics.STATUS.name, reason, utc_us)
             return None
-        message = ReceivedMessage(status.boot_id, status.ticks, status.utc_us, payload)
+        stamp_us = min(status.utc_us, utc_us + MAX_LEAD_US)  # a clock that is ahead is measured, and not refused
+        message = ReceivedMessage(status.boot_id, status.ticks, stamp_us, payload)
         if not self._verifiers[status.agent].accepts(message, utc_us):
             return None
         self._newest[status.agent], self._heard_us[status.agent], self._ended = status, utc_us, None
+        if not status.uses_commitments:  # trajectory messages say more of the clocks of those that commit
+            self._measure_clock(status, utc_us)
         return status
+
+    def _is_far_ahead(self, status: StatusMessage, utc_us: int) -> bool:
+        return status.utc_us - self._clocks.ahead_us(status.agent) > utc_us + _CLOCK_LEAD_US
+
+    def _measure_clock(self, status: StatusMessage, utc_us: int) -> None:
+        self._clocks.received(status.agent, status.utc_us, utc_us)
+        if (lag_us := status.lags_us.get(self._agent)) is not None:
+            self._clocks.answered(status.agent, 0, lag_us, utc_us)
+
+    def next_lags_us(self, utc_us: int) -> dict[int, int]:
+        """Return by how much the newest status of each of some peers came later than it was sent, by its stamp.
+
+        Those that are heard have their turn, one after another.
+        """
+        heard = sorted(agent for agent, at_us in self._heard_us.items() if utc_us - at_us < _HEARD_US)
+        first = bisect.bisect_right(heard, self._lag_told)
+        told = (heard[first:] + heard[:first])[:_LAGS_TOLD]
+        self._lag_told = told[-1] if told else -1
+        return {agent: self._heard_us[agent] - self._newest[agent].utc_us for agent in told}
 
     def take_end(self, sender: str, payload: bytes, utc_us: int) -> None:
         """Believe who runs a peer's process, and has seen it end, however recently the peer was heard."""

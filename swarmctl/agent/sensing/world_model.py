@@ -75,9 +75,10 @@ class WorldModel:
         self._ends_as = {"lag_s": model.lag_s, "drag_1_s": model.drag_1_s}
         self._budget = params.budget
         self.refusals, self.presence = Refusals(note), Presence(bus)
-        self.clocks = PeerClocks(peers, note)
+        self.clocks = PeerClocks(peers, note, trusts_equal=params.mode == "best_effort")
         self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence, clocks=self.clocks)
         self.statuses = PeerStatuses(
+            agent,
             peers,
             bus,
             rate_hz=rate_hz,

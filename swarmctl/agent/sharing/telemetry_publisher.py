@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 from swarmctl.agent.ports import TickSink
 from swarmctl.agent.tick_results import ControlOutput, PlanningResult
@@ -35,6 +35,7 @@ class TelemetryPublisher:
         uses_commitments: whether the agent flies only trajectories it has committed to.
         autopilot: source of the vehicle's reported modes.
         paths: newest paths of peers.
+        lags_us: returns what peers have to know to measure clocks, see `StatusMessage`, at a UTC [us].
         bus, clock, sink: where messages go, their stamps, where records go.
     """
 
@@ -47,12 +48,13 @@ class TelemetryPublisher:
         *,
         autopilot: Autopilot,
         paths: PeerPaths,
+        lags_us: Callable[[int], Mapping[int, int]],
         bus: Bus,
         clock: Clock,
         sink: TickSink,
     ) -> None:
         self._agent, self._boot_id, self._sysid, self._uses_commitments = agent, boot_id, sysid, uses_commitments
-        self._autopilot, self._paths = autopilot, paths
+        self._autopilot, self._paths, self._lags_us = autopilot, paths, lags_us
         self._bus, self._clock, self._sink = bus, clock, sink
         self._recent_ms: deque[float] = deque(maxlen=_RECENT_TICKS)
         self._status_us = -_STATUS_EVERY_US
@@ -203,6 +205,7 @@ class TelemetryPublisher:
             uses_commitments=self._uses_commitments,
             utc_us=record.utc_us,
             without=tuple(sorted(without)),
+            lags_us={} if self._uses_commitments else dict(self._lags_us(record.utc_us)),
         )
 
 

@@ -29,6 +29,9 @@ MAX_REASON = 500  # longest reason of a refusal, or text about what is obeyed
 Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 Agents = Annotated[tuple[Count, ...], msgspec.Meta(max_length=256)]
+Lags = Annotated[
+    dict[Count, Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)]], msgspec.Meta(max_length=256)
+]  # by agent
 
 
 class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -68,6 +71,8 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     uses_commitments: bool  # it flies committed trajectories only, see `control.commit`
     utc_us: Count  # time of sending, by the agent's clock
     without: Agents = ()  # peers that it does not wait for: it has never heard them, and an operator has excluded them
+    # By which the newest status of each of some peers, in turn, came later by the own clock than it was sent by its one.
+    lags_us: Lags = {}
 
 
 class CommandMessage(msgspec.Struct, frozen=True):

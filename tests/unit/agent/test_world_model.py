@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from swarmctl.agent.sensing.peer_statuses import PeerStatuses
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.bus import agent_name
@@ -24,6 +25,9 @@ from swarmctl.bus.messages.json_messages import (
     first_list,
 )
 from swarmctl.bus.messages.path_messages import encode_path
+from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.refusals import Refusals
+from swarmctl.bus.senders import Presence
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.clock import SimClock
@@ -264,6 +268,60 @@ def test_statuses_are_accepted_like_paths_and_future_ready_times_refused() -> No
     bench.tick()
     assert bench.world_model.statuses.inputs()[1] == ready
     assert bench.rejected == {"unconfirmed": 2, "future": 1}
+
+
+@pytest.mark.parametrize(("ahead_us", "measured"), [(300_000, True), (9_000_000, True), (-9_000_000, True), (0, False)])
+def test_in_best_effort_statuses_measure_clocks_by_which_paths_and_ready_times_are_taken(
+    ahead_us: int, measured: bool
+) -> None:
+    """A status says when those of the receiver have arrived, by the clock of its sender."""
+    bench = Bench()
+    for _ in range(3):
+        bench.seq += 10
+        its_us = bench.clock.utc_us() + ahead_us
+        bench.say_status(utc_us=its_us, ready_utc_us=its_us, lags_us={0: ahead_us + 10_000}, uses_commitments=False)
+        bench.tick()
+    assert bench.rejected == {}
+    assert bench.world_model.clocks.ahead_us(1) == pytest.approx(ahead_us, abs=15_000)
+    assert bench.world_model.statuses.inputs()[1].ready_utc_us == pytest.approx(
+        bench.clock.utc_us(), abs=15_000 + TICK_US
+    )
+    assert bench.world_model.statuses.next_lags_us(bench.clock.utc_us()) == {1: TICK_US - ahead_us}
+    assert any(event["event"] == "clock_offset" for event in bench.events) is measured
+    bench.clock.advance(2_000_000)
+    assert bench.world_model.statuses.next_lags_us(bench.clock.utc_us()) == {}, "a clock drifts"
+
+
+def test_a_status_tells_lags_of_a_few_peers_in_turn() -> None:
+    """Its size must not grow with the swarm, whose statuses everybody hears."""
+    peers = range(1, 21)
+    clock, refusals = SimClock(), Refusals(lambda *_, **__: None)
+    hub = LocalHub(clock.now_us)
+    bus = hub.connect(agent_name(0))
+    statuses = PeerStatuses(
+        0,
+        peers,
+        bus,
+        rate_hz=50.0,
+        note=lambda *_, **__: None,
+        refusals=refusals,
+        presence=Presence(bus),
+        clocks=PeerClocks(peers, lambda *_, **__: None),
+        vouchers={},
+    )
+    for peer in peers:
+        said = msgspec.structs.replace(STATUS, agent=peer, ready_utc_us=0, utc_us=clock.utc_us())
+        assert statuses.take(agent_name(peer), encode_message(said), clock.utc_us())
+    told = [list(statuses.next_lags_us(clock.utc_us())) for _ in range(3)]
+    assert [len(agents) for agents in told] == [8, 8, 8]
+    assert told[0] + told[1] + told[2] == [*peers, 1, 2, 3, 4]
+
+
+def test_statuses_of_another_day_are_refused() -> None:
+    bench = Bench()
+    bench.say_status(utc_us=bench.clock.utc_us() + 11_000_000)
+    bench.tick()
+    assert bench.rejected == {"future": 1}
 
 
 def test_statuses_that_waited_for_a_late_receiver_are_no_forgeries() -> None:

@@ -104,3 +104,23 @@ def test_no_room_is_left_for_a_clock_that_is_not_measured() -> None:
     pair.exchange(20_000, 30_000)
     assert pair.clocks.spread_us(1) == pair.clocks.error_us(1) > 0
     assert pair.clocks.spread_us(9) == 0
+
+
+def test_where_clocks_that_may_be_equal_are_trusted_room_is_left_for_those_that_differ() -> None:
+    for ahead_us, leaves_room in ((0, False), (200_000, True)):
+        pair = Pair(ahead_us)
+        pair.clocks = PeerClocks([1], lambda *_, **__: None, trusts_equal=True)
+        pair.exchange(20_000, 30_000)
+        assert (pair.clocks.spread_us(1) > 0) is leaves_room
+
+
+def test_the_operator_is_told_which_clock_is_farthest_off_until_it_is_set() -> None:
+    pair = Pair(-200_000)
+    pair.exchange(20_000, 20_000)
+    assert pair.clocks.alert == (
+        "clock of agent-1 is 0.20 s behind this one, which is allowed for: set the clocks of the hosts (chrony, PTP)"
+    )
+    pair.ahead_us = 0
+    pair.exchange(20_000, 20_000)
+    pair.exchange(20_000, 20_000)
+    assert pair.clocks.alert == ""
