@@ -62,6 +62,7 @@ POINT = ("north_m", "east_m", "down_m")  # arguments of `goto`, shared NED
 YAW, SPEED, FAR = "yaw_deg", "speed_m_s", "far"  # and its optional ones
 FAR_M = 500.0  # from the vehicle; a point farther away is flown to only if that is said
 MISSION, BEGIN = "mission", "begin_utc_s"  # the verb, its argument of the same name: number of the mission; its begin
+CLOCK = "clock_of"  # number of the agent by whose clock the begin is; left out: by that of each agent asked
 _FAR_M = 100_000.0  # from the shared origin
 _AIRBORNE = frozenset({"TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND"})  # the agent decides where it flies
 _NOT_LANDING = _AIRBORNE | {"CONNECT", "STANDBY", "ARM", "DONE"}
@@ -122,6 +123,14 @@ OPERATOR_VERBS = {
         arguments=(
             VerbArgument(name=MISSION, option="--mission", help="Number.", least=0, most=2.0**53),
             VerbArgument(name=BEGIN, option="--begin", help="Begin, UTC [s].", least=0, most=2.0**33),
+            VerbArgument(
+                name=CLOCK,
+                option="--clock-of",
+                help="Agent by whose clock that is.",
+                least=0,
+                most=254,
+                required=False,
+            ),
         ),
     ),
     EXCLUDE: OperatorVerb(

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
-from swarmctl.bus.messages.json_messages import encode_message
+from swarmctl.bus.messages.json_messages import StatusMessage, decode_status, encode_message
 from swarmctl.config import Config, load, load_mission
+from swarmctl.core.clock import ClockError
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import BEGIN, MISSION
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
-from swarmctl.ops.orders.mission_file import mission_message
+from swarmctl.ops.orders.mission_file import mission_message, mission_order
 from tests.closed_loop.conftest import AT_100_HZ
 from tests.closed_loop.test_operator import fly_for, fly_until, outcome, phase
 
@@ -46,13 +49,21 @@ def swap(tmp_path: Path) -> Path:
     return path
 
 
-def order(flight: Lockstep, path: Path, agent: int = -1, *, sent: bool = True, config: Config | None = None) -> None:
+def order(
+    flight: Lockstep,
+    path: Path,
+    agent: int = -1,
+    *,
+    sent: bool = True,
+    config: Config | None = None,
+    statuses: Mapping[int, StatusMessage] = MappingProxyType({}),
+) -> None:
     """Do what `swarmctl mission set` does, by the flight's configuration or another one."""
     message = mission_message(load_mission(config or flight.config, path))
     if sent:
         flight._operator.publish(topics.MISSION, encode_message(message))
-    arguments = {MISSION: float(message.mission), BEGIN: flight.clock.utc_us() * 1e-6 + 1.5}
-    flight.command(MISSION, agent, **arguments)
+    ordered = mission_order(message, statuses, flight.clock.utc_us())
+    flight.command(MISSION, agent, **ordered.arguments)
 
 
 def events(flight: Lockstep, agent: int, name: str) -> list[dict[str, object]]:
@@ -76,6 +87,21 @@ def test_a_hovering_swarm_flies_the_mission_of_a_file_at_one_time_and_apart(mode
     assert [outcome(flight, agent) for agent in range(2)] == ["completed"] * 2
     pos = flight.truth.reshape(-1, 2)["pos_ned_m"]
     assert np.linalg.norm(pos[:, 0] - pos[:, 1], axis=1).min() >= 0.85
+
+
+@pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
+def test_agents_whose_clocks_differ_begin_at_one_time(mode: str, swap: Path) -> None:
+    sets = (*HOVER, "mission.duration_s=60", f"separation.mode={mode}")
+    flight = Lockstep(load(None, sets), clocks={0: ClockError(offset_us=400_000), 1: ClockError(offset_us=-400_000)})
+    operator = flight.hub.connect("verb", {topics.STATUS: None})
+    fly_until(flight, lambda: phase(flight, 0) is phase(flight, 1) is Phase.TRACK)
+    fly_for(flight, 1.0)
+    said = [decode_status(payload) for _, payload in operator.receive(topics.STATUS)]
+    order(flight, swap, statuses={status.agent: status for status in said if status is not None})
+    fly_for(flight, 3.0)
+    times_s = [float(log.rows[-1]["mission_t_s"][0]) for log in flight.logs]
+    assert times_s[0] == pytest.approx(1.6, abs=0.15), "a status may be 0.2 s old"
+    assert times_s[1] == pytest.approx(times_s[0], abs=0.05), "0.8 s apart where each begins by its own clock"
 
 
 def test_before_the_mission_it_is_what_all_begin_with(swap: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from swarmctl.agent.mission.mission_change import MissionChange
 from swarmctl.agent.ports import Ports
 from swarmctl.agent.sensing.world_model import WorldModel
@@ -9,7 +11,7 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.phases.obeyed_orders import outcome_of
 from swarmctl.control.phases.state_machine import MissionStateMachine
-from swarmctl.core.operator_verbs import EXCLUDE, MISSION, PEER, Order
+from swarmctl.core.operator_verbs import BEGIN, CLOCK, EXCLUDE, MISSION, PEER, Order
 
 
 class OperatorOrders:
@@ -42,6 +44,7 @@ class OperatorOrders:
 
     def ask(self, order: Order, now_us: int) -> str:
         """Obey an order, or return why it is refused; the operator is answered either way."""
+        order = self._by_own_clock(order)
         refusal = self._refusal(order, now_us)
         comes_to = "" if refusal else outcome_of(order, self._state_machine.mission)
         self._world_model.answer(order, refusal, comes_to)
@@ -58,6 +61,14 @@ class OperatorOrders:
                 "mission_changed", duration_s=offered.duration_s, mission=offered.text, goal_ned_m=pos_ned_m
             )
         return ""
+
+    def _by_own_clock(self, order: Order) -> Order:
+        """Return the order with its begin by the own clock, where it is by that of an agent: all begin at one time."""
+        if CLOCK not in order.arguments:
+            return order
+        arguments = {name: value for name, value in order.arguments.items() if name != CLOCK}
+        arguments[BEGIN] -= 1e-6 * self._world_model.clocks.ahead_us(int(order.arguments[CLOCK]))
+        return replace(order, arguments=arguments)
 
     def _refusal(self, order: Order, now_us: int) -> str:
         """Obey an order; return why it is refused, or ""."""

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from swarmctl.bus.messages.json_messages import MissionMessage, encode_message
+from swarmctl.bus.messages.json_messages import MissionMessage, StatusMessage, encode_message
 from swarmctl.bus.topics import MAX_MISSION_BYTES
 from swarmctl.bus.topics import MISSION as MISSION_TOPIC
 from swarmctl.config import load_mission, load_recorded
 from swarmctl.control.reference.mission import MissionParams
-from swarmctl.core.operator_verbs import BEGIN, MISSION, Order
+from swarmctl.core.operator_verbs import BEGIN, CLOCK, MISSION, Order
 from swarmctl.errors import ConfigError
 from swarmctl.ops.orders.obstacle_list import read_obstacles
 from swarmctl.ops.orders.operator import read_statuses
 from swarmctl.ops.orders.order_delivery import Reply, deliver
 from swarmctl.ops.running_launches import RunningLaunch
 
-_LEAD_S = 1.5  # from the order to the begin of the mission, the same for all
+_LEAD_S = 1.5  # from the order to the begin of the mission
 _NUMBER_BYTES = 6  # of a digest: a number that a floating-point argument holds exactly
 
 
@@ -36,7 +36,7 @@ def set_mission(launch: RunningLaunch, file: Path, agents: Sequence[int]) -> lis
     if len(payload) > MAX_MISSION_BYTES:
         takes = f"takes {len(payload)} bytes; {MAX_MISSION_BYTES} at most while a launch flies"
         raise ConfigError(str(file), [f"{takes}. Give fewer points, or start a launch with it"])
-    order = Order(MISSION, {MISSION: message.mission, BEGIN: _begin_utc_s(launch)})
+    order = mission_order(message, read_statuses(launch), launch.utc_us())
     return deliver(launch, order, agents, before=((MISSION_TOPIC, payload),))
 
 
@@ -47,7 +47,18 @@ def mission_message(mission: MissionParams) -> MissionMessage:
     return MissionMessage(mission=int.from_bytes(digest, "big"), text=text)
 
 
-def _begin_utc_s(launch: RunningLaunch) -> float:
-    """Return when the mission begins, by the clock of the agent that is farthest ahead."""
-    clocks_us = [status.utc_us for status in read_statuses(launch).values()]
-    return max(clocks_us, default=launch.utc_us()) * 1e-6 + _LEAD_S
+def mission_order(message: MissionMessage, statuses: Mapping[int, StatusMessage], utc_us: int) -> Order:
+    """Return the order to fly a mission: it begins for all at one time, by the clock that is farthest ahead.
+
+    Each agent knows how far that one is from its own. By a clock that is behind, the begin might have passed.
+
+    Args:
+        message: tells the mission.
+        statuses: newest of each agent.
+        utc_us: own clock, which counts where no agent is heard.
+    """
+    arguments: dict[str, float] = {MISSION: message.mission}
+    if statuses:
+        arguments[CLOCK] = max(statuses, key=lambda agent: statuses[agent].utc_us)
+        utc_us = statuses[round(arguments[CLOCK])].utc_us
+    return Order(MISSION, arguments | {BEGIN: utc_us * 1e-6 + _LEAD_S})
