@@ -371,7 +371,9 @@ class Agent:
             arm_in=None if autopilot.dialect is None else autopilot.dialect.arm_in,
             boots=autopilot.clock.boots,
             refusal=self._vehicle_setup.refusal if phase <= Phase.ARM else "",
-            unsettled=self._start_conditions.unsettled(now_us, accuracy_m, state, others_ned_m),
+            unsettled=self._start_conditions.unsettled(
+                now_us, accuracy_m, state, others_ned_m, self._world_model.statuses.codes
+            ),
             too_slow=self._start_conditions.too_slow(now_us, self._deadlines.missed_01),
             overload=self._deadlines.level,
             escalation=self._modes.escalation,

@@ -15,6 +15,7 @@ from swarmctl.config import Config
 from swarmctl.core.clock import Clock
 from swarmctl.core.mavlink_values import AUTOPILOT_COMPID
 from swarmctl.core.types import GeoOrigin
+from swarmctl.flown_code import code_in_words
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import OWN_COMPID, CommandPort
 from swarmctl.mavlink.signing.channel import SigningChannel
@@ -89,6 +90,7 @@ def _setup_of(config: Config, agent: int, boot_id: int, originals: Mapping[str, 
         boot_id=boot_id,
         sysid=config.sysids()[agent],
         vouchers={OPERATOR: frozenset(range(swarm.agents)), **{h.name: frozenset(h.agents) for h in config.hosts}},
+        code=shared_code(config),
         quorum=_quorum(config),
         params=config.agent,
         mission=config.mission,
@@ -102,6 +104,11 @@ def _setup_of(config: Config, agent: int, boot_id: int, originals: Mapping[str, 
         drift_m=config.drift_m,
         originals=originals,
     )
+
+
+def shared_code(config: Config) -> str:
+    """Return what code flies here, which has to be the same on every computer; "" on one alone, where it is."""
+    return code_in_words(config.own_folder) if config.hosts else ""
 
 
 def _quorum(config: Config) -> int:

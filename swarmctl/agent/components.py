@@ -219,6 +219,7 @@ def make_telemetry_publisher(
         setup.boot_id,
         setup.sysid,
         separation.uses_commitments,
+        code=setup.code,
         autopilot=ports.autopilot,
         paths=world_model.paths,
         lags_us=world_model.statuses.next_lags_us,

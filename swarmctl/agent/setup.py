@@ -54,6 +54,7 @@ class AgentSetup:
     boot_id: int
     sysid: int
     vouchers: Mapping[str, frozenset[int]]  # agents of which each sender may say that they have ended
+    code: str  # that it flies, as those of its peers have to; "" where all are on one computer
     quorum: int  # agents on the bus, this one included, by which a silent one that is not on it counts as dead
     params: AgentParams
     mission: MissionParams

@@ -40,18 +40,20 @@ class StartConditions:
         pos_accuracy_m: float | None,
         state: VehicleState | None,
         others_ned_m: Callable[[], Sequence[Array]],
+        codes: Callable[[], Mapping[int, str]] = dict,
     ) -> str:
         """Return why arming, or the climb that follows it, must wait, or "".
 
-        The estimator still settles, or is too inaccurate for the separation, or another vehicle stands too close: the
-        autopilot, which climbs first, knows no peers. Between arming and the climb another one may come, where an order
-        or a lost link delays the climb.
+        A peer flies other code, the estimator still settles, or is too inaccurate for the separation, or another
+        vehicle stands too close: the autopilot, which climbs first, knows no peers. Between arming and the climb
+        another one may come, where an order or a lost link delays the climb.
 
         Args:
             now_us: monotonic time.
             pos_accuracy_m: newest reported accuracy, 1-sigma; None while there is none.
             state: newest one.
             others_ned_m: returns the position (3,) of each peer.
+            codes: returns the code that each peer flies, by agent number.
         """
         if len(self._setup.starts_ned_m) == 1:
             return ""
@@ -62,8 +64,21 @@ class StartConditions:
         self._accuracy.update(now_us, pos_accuracy_m)
         accuracy_m = self._accuracy.worst_m or 0.0  # if not reported, only body size and tracking error are checked
         separation = self._setup.separation
-        problem = self._accuracy.unsettled(now_us) or radius_problem(separation, accuracy_m, self._setup.drift_m)
+        problem = (
+            self._other_code(codes)
+            or self._accuracy.unsettled(now_us)
+            or radius_problem(separation, accuracy_m, self._setup.drift_m)
+        )
         return problem or self._who_is_beside(state, others_ned_m, now_us, away_for_us=_APART_FOR_US)
+
+    def _other_code(self, codes: Callable[[], Mapping[int, str]]) -> str:
+        """Return which peer flies other code than this agent, whose predictions of it would be wrong, or ""."""
+        own = self._setup.code
+        others = {agent: code for agent, code in codes().items() if code != own} if own else {}
+        if not others:
+            return ""
+        agent = min(others)
+        return f"{agent_name(agent)} to fly the same code: {others[agent] or 'an older swarmctl'} there, {own} here"
 
     def _who_is_beside(
         self,

@@ -169,6 +169,10 @@ class PeerStatuses:
         status = self._newest.get(agent)
         return status is None or status.uses_commitments
 
+    def codes(self) -> dict[int, str]:
+        """Return the code that each peer flies, as its status says; "" where it does not."""
+        return {agent: status.code for agent, status in self._newest.items()}
+
     def inputs(self) -> dict[int, PeerInputs]:
         """Return phase, ready time by the own clock, and liveliness of every peer that has published a status."""
         alive = self._bus.alive()

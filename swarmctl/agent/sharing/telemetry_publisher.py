@@ -33,6 +33,7 @@ class TelemetryPublisher:
     Args:
         agent, boot_id, sysid: identity in the messages.
         uses_commitments: whether the agent flies only trajectories it has committed to.
+        code: that it flies, see `AgentSetup`.
         autopilot: source of the vehicle's reported modes.
         paths: newest paths of peers.
         lags_us: returns what peers have to know to measure clocks, see `StatusMessage`, at a UTC [us].
@@ -46,6 +47,7 @@ class TelemetryPublisher:
         sysid: int,
         uses_commitments: bool,
         *,
+        code: str,
         autopilot: Autopilot,
         paths: PeerPaths,
         lags_us: Callable[[int], Mapping[int, int]],
@@ -54,6 +56,7 @@ class TelemetryPublisher:
         sink: TickSink,
     ) -> None:
         self._agent, self._boot_id, self._sysid, self._uses_commitments = agent, boot_id, sysid, uses_commitments
+        self._code = code
         self._autopilot, self._paths, self._lags_us = autopilot, paths, lags_us
         self._bus, self._clock, self._sink = bus, clock, sink
         self._recent_ms: deque[float] = deque(maxlen=_RECENT_TICKS)
@@ -205,6 +208,7 @@ class TelemetryPublisher:
             uses_commitments=self._uses_commitments,
             utc_us=record.utc_us,
             without=tuple(sorted(without)),
+            code=self._code,
             lags_us={} if self._uses_commitments else dict(self._lags_us(record.utc_us)),
         )
 

@@ -71,7 +71,8 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     uses_commitments: bool  # it flies committed trajectories only, see `control.commit`
     utc_us: Count  # time of sending, by the agent's clock
     without: Agents = ()  # peers that it does not wait for: it has never heard them, and an operator has excluded them
-    # By which the newest status of each of some peers, in turn, came later by the own clock than it was sent by its one.
+    code: Annotated[str, msgspec.Meta(max_length=128)] = ""  # that it flies, told where agents are on several computers
+    # By which the newest status of each of some peers, in turn, came later by the own clock than it was sent by theirs.
     lags_us: Lags = {}
 
 
@@ -222,7 +223,7 @@ def encode_message(message: msgspec.Struct) -> bytes:
 
 def decode_status(payload: bytes) -> StatusMessage | None:
     """Decode a status; None if it is malformed or out of bounds."""
-    return _printable(_decode(payload, _STATUS_DECODER), "control", "outcome", "active_alert")
+    return _printable(_decode(payload, _STATUS_DECODER), "control", "outcome", "active_alert", "code")
 
 
 def decode_command(payload: bytes) -> CommandMessage | None:

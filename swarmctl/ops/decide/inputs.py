@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.agent.assembly import shared_code
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import (
@@ -151,7 +152,7 @@ def peer_messages(
             paths = zip(stamps_us, _paths(config, peer, rows, plans[peer]), strict=True)
             heard += [_path_message(config, utc_us, path) for utc_us, path in paths if path is not None]
             said = np.diff(rows["phase"].astype(int), prepend=-1) != 0
-            heard += map(_status_message, _statuses(peer, rows, said | (rows["seq"] % _STATUS_EVERY == 0)))
+            heard += map(_status_message, _statuses(config, peer, rows, said | (rows["seq"] % _STATUS_EVERY == 0)))
     return sorted(heard, key=lambda message: message[0])
 
 
@@ -173,7 +174,9 @@ def received_messages(
         earlier = (rows["seq"].astype(np.int64) - 1).tolist()  # a path is numbered before its tick is counted
         paths[peer] = dict(zip(earlier, _paths(config, peer, rows, plans[peer]), strict=True))
         theirs = received[(received["kind"] == ReceivedKind.STATUS) & (received["sender"] == peer)]
-        statuses[peer] = {said.ticks: said for said in _statuses(peer, rows, np.isin(rows["seq"], theirs["seq"]))}
+        statuses[peer] = {
+            said.ticks: said for said in _statuses(config, peer, rows, np.isin(rows["seq"], theirs["seq"]))
+        }
     heard: dict[int, list[Heard]] = {}
     for t_us, kind, sender, seq, stamp_us, margin_m, keeps_up in received.tolist():
         now = heard.setdefault(t_us, [])
@@ -265,9 +268,9 @@ def _state(row: NDArray[np.void]) -> VehicleState:
     )
 
 
-def _statuses(peer: int, rows: NDArray[np.void], said: NDArray[np.bool_]) -> Iterator[StatusMessage]:
+def _statuses(config: Config, peer: int, rows: NDArray[np.void], said: NDArray[np.bool_]) -> Iterator[StatusMessage]:
     """Yield what a peer has said of itself in the ticks in which it has, as far as others use it."""
-    ready_us = _ready_utc_us(rows)
+    ready_us, code = _ready_utc_us(rows), shared_code(config)
     for row in rows[said]:
         utc_us = int(row["utc_us"])
         yield StatusMessage(
@@ -303,6 +306,7 @@ def _statuses(peer: int, rows: NDArray[np.void], said: NDArray[np.bool_]) -> Ite
             alert_age_s=0.0,
             uses_commitments=False,
             utc_us=utc_us,
+            code=code,
         )
 
 

@@ -19,6 +19,7 @@ from tests import builders
 
 SECOND = 1_000_000
 SETUP = SimpleNamespace(
+    code="",
     starts_ned_m=np.zeros((2, 3)),
     separation=SeparationParams(),
     drift_m=0.0,
@@ -107,3 +108,21 @@ def test_an_agent_whose_processor_has_too_much_to_do_waits_until_it_keeps_up_for
     assert waits_for(9.1, 0.2) == f"{few} (now 20 %)"
     mission.phase = Phase.ARM
     assert waits_for(9.2, 0.5) == "", "overload in flight has other consequences"
+
+
+@pytest.mark.parametrize(
+    ("own", "others", "said"),
+    [
+        ("swarmctl 2", {1: "swarmctl 2"}, ""),
+        ("swarmctl 2", {1: "swarmctl 3"}, "agent-1 to fly the same code: swarmctl 3 there, swarmctl 2 here"),
+        ("swarmctl 2", {1: ""}, "agent-1 to fly the same code: an older swarmctl there, swarmctl 2 here"),
+        ("", {1: ""}, ""),
+    ],
+)
+def test_nobody_is_armed_among_agents_that_fly_other_code(own: str, others: dict[int, str], said: str) -> None:
+    setup, mission = SimpleNamespace(**vars(SETUP) | {"code": own}), SimpleNamespace(phase=Phase.STANDBY)
+    conditions = StartConditions(cast(AgentSetup, setup), cast(MissionState, mission), Alerts())
+    stands = builders.vehicle_state(landed=Landed.ON_GROUND)
+    for second in range(6):
+        waits_for = conditions.unsettled(second * SECOND, 0.05, stands, tuple, lambda: others)
+    assert waits_for == said
