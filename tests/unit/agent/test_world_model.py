@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -114,21 +115,21 @@ def test_a_list_of_too_many_obstacles_is_refused_and_reported() -> None:
     assert bench.world_model.refusals.alert(bench.clock.utc_us()) == "obstacles of operator refused: malformed"
 
 
-def least_cost_s(obstacles: int) -> float:
-    """Return the shortest time that keep-outs and bodies have taken in one of 40 ticks."""
-    bench = Bench()
-    bench.set_obstacles(obstacles, 1)
-    durations_s = []
-    for _ in range(40):
-        began_s = time.perf_counter()
-        bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, phase=Phase.TRACK)
-        bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.1, 0.1, committed_peers={})
-        durations_s.append(time.perf_counter() - began_s)
-    return min(durations_s)
+def cost_s(bench: Bench) -> float:
+    """Return the processor time that keep-outs and bodies take in one tick."""
+    began_s = time.thread_time()
+    bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, phase=Phase.TRACK)
+    bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.1, 0.1, committed_peers={})
+    return time.thread_time() - began_s
 
 
 def test_the_cost_of_obstacles_grows_no_faster_than_their_number() -> None:
-    assert least_cost_s(MAX_OBSTACLES) < 10.0 * least_cost_s(MAX_OBSTACLES // 8), "8 times at most, and noise"
+    """Ticks with few and with many take turns, because processors change their speed."""
+    few, many = Bench(), Bench()
+    few.set_obstacles(MAX_OBSTACLES // 8, 1)
+    many.set_obstacles(MAX_OBSTACLES, 1)
+    ratios = [cost_s(many) / cost_s(few) for _ in range(60)]
+    assert statistics.median(ratios) < 10.0, "8 times at most, and noise"
 
 
 def test_a_version_far_ahead_does_not_block_later_ones() -> None:
