@@ -52,6 +52,7 @@ class Bench:
             [*peers],
             separation,
             self.bus,
+            utc_us=self.clock.utc_us,
             rate_hz=RATE_HZ,
             note=lambda *_, **__: None,
             vouchers={},
@@ -69,6 +70,7 @@ class Bench:
             separation=separation,
             world_model=self.world_model,
             bus=self.bus,
+            utc_us=self.clock.utc_us,
             note=lambda name, **fields: self.told.append((name, fields)),
             rate_hz=RATE_HZ,
             far_peers=FarPeers(

@@ -45,6 +45,7 @@ class Coordination:
         separation: distances to keep.
         world_model: paths, statuses and presence of peers, and obstacles.
         bus: is drained by `receive`.
+        utc_us: the own clock, by which messages arrive.
         rate_hz: tick rate of every agent.
         far_peers: chooses the peers whose acknowledgements can be done without.
         far_hz: how often those are told; 0: nobody is far.
@@ -72,12 +73,13 @@ class Coordination:
         separation: SeparationParams,
         world_model: WorldModel,
         bus: Bus,
+        utc_us: Callable[[], int],
         note: Callable[..., None],
         rate_hz: float,
         far_peers: FarPeers,
         far_hz: float,
     ) -> None:
-        self._agent, self._bus, self._world_model = agent, bus, world_model
+        self._agent, self._bus, self._world_model, self._utc_us = agent, bus, world_model, utc_us
         self._commitments = Commitments(agent, params, planner)
         refusals, presence = world_model.refusals, world_model.presence
         self._peer_trajectories = PeerTrajectories(
@@ -122,8 +124,9 @@ class Coordination:
     def receive(self, utc_us: int) -> None:
         """Apply rule 1: take in every message that has arrived, and what it says about silent peers."""
         for topic in (topics.FAR_TRAJECTORY, topics.TRAJECTORY):
-            for sender, payload in self._bus.receive(topic):
-                self._peer_trajectories.offer(sender, payload, utc_us)
+            messages, arrived_us = self._bus.receive(topic), self._utc_us()  # in this order: none came later
+            for sender, payload in messages:
+                self._peer_trajectories.offer(sender, payload, arrived_us)
         self._update_membership(utc_us)
         self._attend(utc_us)
 

@@ -45,6 +45,7 @@ class WorldModel:
         peers: indices of the other agents.
         params: distances and ages.
         bus: source of messages, drained by `receive`.
+        utc_us: the own clock, by which messages arrive.
         rate_hz: tick rate of every agent.
         vouchers: agents of which each sender may say that they have ended.
         quorum: see `AgentSetup`.
@@ -64,6 +65,7 @@ class WorldModel:
         params: SeparationParams,
         bus: Bus,
         *,
+        utc_us: Callable[[], int],
         rate_hz: float,
         note: Callable[..., None],
         vouchers: Mapping[str, Set[int]],
@@ -71,7 +73,7 @@ class WorldModel:
         model: VehicleModelParams,
     ) -> None:
         self._agent, self._params, self._bus, self._note = agent, params, bus, note
-        self._peers, self._quorum = peers, quorum
+        self._peers, self._quorum, self._utc_us = peers, quorum, utc_us
         self._ends_as = {"lag_s": model.lag_s, "drag_1_s": model.drag_1_s}
         self._budget = params.budget
         self.refusals, self.presence = Refusals(note), Presence(bus)
@@ -100,8 +102,9 @@ class WorldModel:
         for sender, payload in self._received_paths():
             if path := self.paths.offer(sender, payload, utc_us):
                 self.accepted.append(path)
-        for sender, payload in self._bus.receive(topics.STATUS):
-            if status := self.statuses.take(sender, payload, utc_us):
+        statuses, arrived_us = self._bus.receive(topics.STATUS), self._utc_us()  # in this order: none came later
+        for sender, payload in statuses:
+            if status := self.statuses.take(sender, payload, arrived_us):
                 self.accepted.append(status)
         for sender, payload in self._bus.receive(topics.OBSTACLES):
             if refusal := self.obstacles.take(payload):

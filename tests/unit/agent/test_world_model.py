@@ -63,6 +63,7 @@ class Bench:
             [1, 2],
             SeparationParams(),
             self.bus,
+            utc_us=self.clock.utc_us,
             rate_hz=50.0,
             note=note,
             vouchers=vouchers,
@@ -291,6 +292,26 @@ def test_in_best_effort_statuses_measure_clocks_by_which_paths_and_ready_times_a
     assert any(event["event"] == "clock_offset" for event in bench.events) is measured
     bench.clock.advance(2_000_000)
     assert bench.world_model.statuses.next_lags_us(bench.clock.utc_us()) == {}, "a clock drifts"
+
+
+def test_a_status_that_comes_while_the_agent_is_held_up_says_nothing_of_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the begin of a tick and its look at the bus other programs may run, and peers send."""
+    bench = Bench()
+    receive = bench.bus.receive
+
+    def late(topic: topics.Topic) -> Any:
+        if topic is topics.STATUS:
+            bench.clock.advance(30_000)
+            bench.seq += 10
+            bench.say_status(lags_us={0: 80_000}, uses_commitments=False)
+            bench.clock.advance(30_000)
+        return receive(topic)
+
+    monkeypatch.setattr(bench.bus, "receive", late)
+    for _ in range(3):
+        bench.tick()
+    assert bench.world_model.statuses.inputs()
+    assert bench.world_model.clocks.ahead_us(1) == 0
 
 
 def test_a_status_tells_lags_of_a_few_peers_in_turn() -> None:

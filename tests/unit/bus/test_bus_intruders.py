@@ -109,6 +109,7 @@ class Scene:
             [1, 2],
             SeparationParams(),
             self.bus,
+            utc_us=lambda: self.now_us,
             rate_hz=RATE_HZ,
             note=lambda *_, **__: None,
             vouchers=vouchers,
