@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep, _is_due
+from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.config import load
 from swarmctl.core.clock import ClockError, OffsetClock, SimClock
 from swarmctl.errors import ConfigError
@@ -54,11 +55,21 @@ def test_an_agent_stamps_its_ticks_and_events_with_its_own_clock(skewed: Lockste
         assert event["utc_us"] - event["t_us"] - SimClock().utc_us() == pytest.approx(least_us, abs=2000)
 
 
-def test_agents_begin_the_mission_at_the_same_time_of_their_own_clocks(skewed: Lockstep) -> None:
-    begin_us = {i: mission_start_us({i: skewed.logs[i].ticks}, "utc_us") for i in (0, 1)}
-    assert begin_us[0] is not None and begin_us[0] == begin_us[1]
+def test_agents_begin_the_mission_at_one_time_whatever_their_clocks_say(skewed: Lockstep) -> None:
+    begin_us = [mission_start_us({i: skewed.logs[i].ticks}, "utc_us") for i in (0, 1)]
+    assert begin_us[0] is not None and begin_us[1] is not None
+    assert begin_us[1] - begin_us[0] == pytest.approx(AHEAD_US, abs=20_000), "each by its own clock"
     first_us = [int(tracking_rows(log.ticks)["t_us"][0]) for log in skewed.logs]
-    assert first_us[0] - first_us[1] == pytest.approx(AHEAD_US, abs=20_000), "the one ahead begins earlier"
+    assert first_us[0] == pytest.approx(first_us[1], abs=20_000)
+
+
+def test_negative_control_by_clocks_that_nobody_measures_the_one_ahead_begins_earlier(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(PeerClocks, "ahead_us", lambda self, agent: 0)
+    apart = flown({1: ClockError(offset_us=AHEAD_US)})
+    first_us = [int(tracking_rows(log.ticks)["t_us"][0]) for log in apart.logs]
+    assert first_us[0] - first_us[1] == pytest.approx(AHEAD_US, abs=20_000)
 
 
 def test_the_evaluation_compares_records_of_wrong_clocks_at_their_monotonic_time(skewed: Lockstep) -> None:
