@@ -46,7 +46,7 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     (line,) = shown(r"^swarmctl launch configs/thesis")
     station = GroundStation()
     forward = f"mavlink.forward=['udpout://127.0.0.1:{station.port}']"
-    launched = start(*shlex.split(line)[2:], "--duration", "3", low(line), "--no-view", "--set", forward)
+    launched = start(*shlex.split(line)[2:], "--duration", "10", low(line), "--no-view", "--set", forward)
     assert sorted(station.read_parameter("COM_OF_LOSS_T")) == [1, 2, 3], "every vehicle answers through its agent"
     station.close()
     launched.until_phase("TRACK", 3)
