@@ -225,8 +225,8 @@ class Agent:
             deadline_misses=deadline_misses,
             timing=self.timing,
         )
-        heard = self._world_model
-        self._publisher.publish(record, self._mission, heard.statuses.excused, heard.accepted)
+        world_model = self._world_model
+        self._publisher.publish(record, self._mission, world_model.statuses.excused, world_model.accepted)
         return record
 
     def _timing(self, began_ns: int, sensed_ns: int, planned_ns: int, sent_ns: int, plan: Plan | None) -> TickTiming:

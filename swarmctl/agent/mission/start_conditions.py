@@ -40,7 +40,7 @@ class StartConditions:
         pos_accuracy_m: float | None,
         state: VehicleState | None,
         others_ned_m: Callable[[], Sequence[Array]],
-        codes: Callable[[], Mapping[int, str]] = dict,
+        codes: Callable[[], Mapping[int, str]],
     ) -> str:
         """Return why arming, or the climb that follows it, must wait, or "".
 

@@ -21,7 +21,7 @@ from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.types import FLOWN_BY_AGENT, FlightMode, Landed, Phase
 
 _COMPANY_US = 10_000_000  # a peer whose last status is older has left
-_HEARD_US = 2_000_000  # whose clock is measured: ten statuses
+SILENT_US = 2_000_000  # ten statuses; who is heard within it has not ended, and its clock is measured
 _LAGS_TOLD = 8  # in one status, so that its size does not grow with the swarm: 50 peers are told in 1.4 s
 _READY_LEAD_US = 1_000_000  # largest lead of a peer's ready time over its status
 _CLOCK_LEAD_US = 10_000_000  # largest lead of a peer's clock over ours; seals are held to it, too
@@ -104,7 +104,7 @@ class PeerStatuses:
 
         Those that are heard have their turn, one after another.
         """
-        heard = sorted(agent for agent, at_us in self._heard_us.items() if utc_us - at_us < _HEARD_US)
+        heard = sorted(agent for agent, at_us in self._heard_us.items() if utc_us - at_us < SILENT_US)
         first = bisect.bisect_right(heard, self._lag_told)
         told = (heard[first:] + heard[:first])[:_LAGS_TOLD]
         self._lag_told = told[-1] if told else -1
@@ -143,7 +143,7 @@ class PeerStatuses:
 
         Somebody vouches for the end of its process, or it was heard done, and sends nothing to its vehicle any more.
         """
-        return self.process_has_ended(agent, self.boot_id(agent)) or self._is_in(agent, Phase.DONE)
+        return self.process_has_ended(agent, self.boot_id(agent)) or self.is_done(agent)
 
     @property
     def ended(self) -> frozenset[int]:

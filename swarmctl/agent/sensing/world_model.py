@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 
 from swarmctl.agent.sensing.known_obstacles import KnownObstacles
-from swarmctl.agent.sensing.peer_statuses import PeerStatuses
+from swarmctl.agent.sensing.peer_statuses import SILENT_US, PeerStatuses
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import StatusMessage
@@ -32,7 +32,6 @@ from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Array, Phase, PredictedPath
 
-_SILENT_US = 2_000_000  # ten statuses; who is heard within it has not ended
 _EXPECTED_US = 160_000  # `heartbeat_s` and three ticks; whose path is older may fly another one
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 
@@ -269,7 +268,7 @@ class WorldModel:
         """
         heard_us = max(self.statuses.heard_us(agent), self.paths.newest_utc_us(agent))
         age_us = max(0, utc_us - heard_us)
-        if self.statuses.has_ended(agent) or age_us >= _SILENT_US:
+        if self.statuses.has_ended(agent) or age_us >= SILENT_US:
             return ""
         return f"{agent_name(agent)} was heard {age_us * 1e-6:.1f} s ago, so it has not ended"
 

@@ -15,8 +15,10 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 
 from swarmctl.core.json_safe import to_json
-from swarmctl.core.recorded.received import RECEIVED_COLUMNS, RECEIVED_DTYPE
-from swarmctl.core.recorded.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
+from swarmctl.core.recorded.received import RECEIVED_COLUMNS
+from swarmctl.core.recorded.records import PLAN_COLUMNS, TRUTH_COLUMNS
+from swarmctl.core.recorded.stored_column import StoredColumn, dtype_of
+from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import hold, is_held, replace_bytes, replace_text, write_each
@@ -54,6 +56,13 @@ _OUTCOME_BYTES = 4096
 _PROBLEM_CHARACTERS = 500  # of a problem that is kept in it
 _LAUNCHES_PER_SECOND = 1000
 _TAKEN = frozenset((EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING, REPORT, STUDY_ROWS))
+
+_RAW_ROWS = (  # files of raw rows, the suffixes that they have as Parquet, and their columns
+    ("agent-*.ticks", PACKED_TICKS, COLUMNS),
+    ("agent-*.plans", PACKED_PLANS, PLAN_COLUMNS),
+    ("agent-*.received", PACKED_RECEIVED, RECEIVED_COLUMNS),
+    (TRUTH, Path(PACKED_TRUTH).suffix, TRUTH_COLUMNS),
+)
 
 
 def create_run_folder(
@@ -167,10 +176,11 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
     writers: dict[str, Callable[[], object]] = {
         EVENTS: partial(_write_events, directory, run.events),
         SUMMARY: partial(replace_text, directory / SUMMARY, to_json(summary, indent=2) + "\n"),
-        **{path.name: partial(_pack_ticks, path) for path in sorted(directory.glob("agent-*.ticks"))},
-        **{path.name: partial(_pack_plans, path) for path in sorted(directory.glob("agent-*.plans"))},
-        **{path.name: partial(_pack_received, path) for path in sorted(directory.glob("agent-*.received"))},
-        **{path.name: partial(_pack_truth, path) for path in directory.glob(TRUTH)},
+        **{
+            path.name: partial(_pack, path, suffix, columns)
+            for raw, suffix, columns in _RAW_ROWS
+            for path in sorted(directory.glob(raw))
+        },
         REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules=rules),
     }
     unwritten = write_each(writers)
@@ -331,25 +341,7 @@ def _write_events(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         path.unlink()
 
 
-def _pack_ticks(path: Path) -> None:
+def _pack(path: Path, suffix: str, columns: Sequence[StoredColumn]) -> None:
     """Replace a file of raw rows by Parquet."""
-    write_parquet(path.with_suffix(PACKED_TICKS), read_rows(path, TICK_DTYPE))
-    path.unlink()
-
-
-def _pack_plans(path: Path) -> None:
-    """Replace the raw points of an agent's predicted paths by Parquet."""
-    write_parquet(path.with_suffix(PACKED_PLANS), read_rows(path, PLAN_DTYPE), PLAN_COLUMNS)
-    path.unlink()
-
-
-def _pack_received(path: Path) -> None:
-    """Replace the raw rows of what an agent's ticks have received by Parquet."""
-    write_parquet(path.with_suffix(PACKED_RECEIVED), read_rows(path, RECEIVED_DTYPE), RECEIVED_COLUMNS)
-    path.unlink()
-
-
-def _pack_truth(path: Path) -> None:
-    """Replace the simulator's raw rows by Parquet."""
-    write_parquet(path.with_name(PACKED_TRUTH), read_rows(path, TRUTH_DTYPE), TRUTH_COLUMNS)
+    write_parquet(path.with_suffix(suffix), read_rows(path, dtype_of(columns)), columns)
     path.unlink()

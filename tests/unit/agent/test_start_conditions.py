@@ -70,7 +70,7 @@ def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_w
 
     def waits_for(at_s: float, north_m: float) -> str:
         other = np.array([north_m, 0.0, -9.0])  # its height is no matter to a vehicle that climbs
-        return conditions.unsettled(round(at_s * SECOND), 0.05, stands, lambda: [other])
+        return conditions.unsettled(round(at_s * SECOND), 0.05, stands, lambda: [other], dict)
 
     for tenth in range(50):
         waits_for(tenth / 10.0, 1.0)
