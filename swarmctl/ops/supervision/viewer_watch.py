@@ -1,12 +1,14 @@
-"""Watches the viewer process of a launch or station: where it shows the flight, and whether it freezes or ends."""
+"""Watches the viewer of a launch or station: where it shows the flight, and whether it is late, freezes or ends."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 from swarmctl.ops.processes import Child
 
 _ADDRESS, _PAGE = "viewer rerun+", "page http://"  # how the lines begin in which it says where
+_LATE_S = 20.0  # to come up, which takes 2 to 5 s: it yields to all processes of the flight
 
 
 class ViewerWatch:
@@ -16,14 +18,22 @@ class ViewerWatch:
         child: the process; None without a view.
         tell: receives event, text and fields.
         publish: receives the address of the live view, for the operator's `view`.
+        clock_s: monotonic time [s].
     """
 
-    def __init__(self, child: Child | None, tell: Callable[..., None], publish: Callable[[str], None]) -> None:
-        self._child, self._tell, self._publish = child, tell, publish
+    def __init__(
+        self,
+        child: Child | None,
+        tell: Callable[..., None],
+        publish: Callable[[str], None],
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._child, self._tell, self._publish, self._clock_s = child, tell, publish, clock_s
+        self._late_at_s = clock_s() + _LATE_S
         argv = () if child is None else child.argv
         self._hint = "" if {"--view", "--web"} & {*argv} else " (no window; open one with: swarmctl view)"
         self._awaited = [] if child is None else [_ADDRESS, *([_PAGE] if "--web" in child.argv else [])]
-        self._is_frozen = False
+        self._is_frozen = self._is_late = False
 
     def step(self) -> None:
         """Tell what has happened since the last time."""
@@ -38,6 +48,9 @@ class ViewerWatch:
         elif not self._is_frozen and child.is_stopped():
             self._is_frozen = True
             self._tell("viewer_frozen", "viewer is frozen; the flight goes on")
+        elif _ADDRESS in self._awaited and not (self._is_late or self._is_frozen) and self._clock_s() > self._late_at_s:
+            self._is_late = True
+            self._tell("viewer_late", f"viewer is not up after {_LATE_S:g} s; the flight goes on")
 
     def _take(self, line: str) -> None:
         """Tell the address that a line says."""

@@ -33,7 +33,8 @@ class Viewer(Child):
 class Scene:
     def __init__(self, *argv: str) -> None:
         self.viewer, self.told, self.published = Viewer(*argv), list[str](), list[str]()
-        self.watch = ViewerWatch(self.viewer, self.tell, self.published.append)
+        self.now_s = 100.0
+        self.watch = ViewerWatch(self.viewer, self.tell, self.published.append, lambda: self.now_s)
 
     def tell(self, event: str, text: str, **fields: Any) -> None:
         self.told.append(text)
@@ -62,6 +63,25 @@ def test_a_viewer_that_freezes_before_it_serves_a_page_or_ends_is_told_once() ->
     assert scene.step() == [f"view {LIVE}", "viewer is frozen; the flight goes on"]
     scene.viewer.code = 137
     assert scene.step() == ["view and recording stopped: viewer was killed; the flight goes on"]
+
+
+def test_a_viewer_that_does_not_come_up_is_told_once_and_its_address_when_it_does() -> None:
+    scene = Scene()
+    scene.now_s += 19.0
+    assert scene.step() == []
+    scene.now_s += 2.0
+    assert scene.step() == ["viewer is not up after 20 s; the flight goes on"]
+    scene.viewer.said = [f"viewer {LIVE}"]
+    scene.now_s += 100.0
+    assert scene.step() == [f"view {LIVE} (no window; open one with: swarmctl view)"]
+
+
+def test_a_viewer_that_is_up_in_time_is_not_late() -> None:
+    scene = Scene()
+    scene.viewer.said = [f"viewer {LIVE}"]
+    scene.step()
+    scene.now_s += 100.0
+    assert scene.step() == []
 
 
 def test_without_a_view_nothing_is_told() -> None:
