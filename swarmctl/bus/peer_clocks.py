@@ -21,6 +21,7 @@ _WINDOW_US = 5_000_000  # bounds of this window and of the one before are kept
 _DRIFT_US = 2_000  # two clocks drift apart by less in two windows: 200 ppm
 _UNKNOWN_US = 1 << 62
 _UNMEASURED_US = 1 << 61  # bounds beyond are none
+_ADVICE = "Set the clocks of the hosts (chrony, PTP)"
 _REPORTED_US = 50_000  # corrections that differ by more from the last one reported are
 
 
@@ -90,11 +91,19 @@ class PeerClocks:
     def __init__(self, peers: Iterable[int], note: Callable[..., None], *, trusts_equal: bool = False) -> None:
         self._clocks = {agent: _PeerClock() for agent in peers}
         self._note, self._trusts_equal = note, trusts_equal
+        self._refused_us: dict[int, int] = {}  # by peer: how far a refused message was ahead
         self.alert = ""
 
     def received(self, agent: int, sent_utc_us: int, utc_us: int) -> None:
         """Take in a message that a peer stamped `sent_utc_us`, received now."""
+        if self._refused_us.pop(agent, None) is not None:
+            self.alert = self._farthest_off()
         self._narrow(agent, sent_utc_us - utc_us, _UNKNOWN_US, utc_us)
+
+    def refused(self, agent: int, sent_utc_us: int, utc_us: int) -> None:
+        """Take in that a message was refused now, because the stamp of the peer is too far ahead to allow for."""
+        self._refused_us[agent] = sent_utc_us - utc_us
+        self.alert = self._farthest_off()
 
     def answered(self, agent: int, sent_utc_us: int, received_utc_us: int, utc_us: int) -> None:
         """Take in when a peer, by its clock, received the own message stamped `sent_utc_us`."""
@@ -127,9 +136,15 @@ class PeerClocks:
             self.alert = self._farthest_off()
 
     def _farthest_off(self) -> str:
+        if self._refused_us:
+            agent, ahead_us = max(self._refused_us.items(), key=lambda item: item[1])
+            return f"{_apart(agent, ahead_us)}, which is too far: nothing it says is believed. {_ADVICE}"
         agent, clock = max(self._clocks.items(), key=lambda item: abs(item[1].reported_us))
-        off_s = clock.reported_us * 1e-6
         if abs(clock.reported_us) <= _REPORTED_US:
             return ""
-        apart = f"clock of {agent_name(agent)} is {abs(off_s):.2f} s {'ahead of' if off_s > 0.0 else 'behind'} this one"
-        return f"{apart}, which is allowed for: set the clocks of the hosts (chrony, PTP)"
+        return f"{_apart(agent, clock.reported_us)}, which is allowed for. {_ADVICE}"
+
+
+def _apart(agent: int, ahead_us: int) -> str:
+    off_s = ahead_us * 1e-6
+    return f"clock of {agent_name(agent)} is {abs(off_s):.2f} s {'ahead of' if off_s > 0.0 else 'behind'} this one"

@@ -77,8 +77,11 @@ class PeerStatuses:
             reason = IDENTITY
         elif status.agent not in self._verifiers:
             reason = UNKNOWN_PEER
-        elif status.ready_utc_us > status.utc_us + _READY_LEAD_US or self._is_far_ahead(status, utc_us):
+        elif status.ready_utc_us > status.utc_us + _READY_LEAD_US:
             reason = FUTURE
+        elif self._is_far_ahead(status, utc_us):
+            reason = FUTURE
+            self._clocks.refused(status.agent, status.utc_us, utc_us)
         if reason or status is None:
             self._refusals.add(sender, topics.STATUS.name, reason, utc_us)
             return None

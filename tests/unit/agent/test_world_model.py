@@ -344,6 +344,7 @@ def test_statuses_of_another_day_are_refused() -> None:
     bench.say_status(utc_us=bench.clock.utc_us() + 11_000_000)
     bench.tick()
     assert bench.rejected == {"future": 1}
+    assert bench.world_model.clocks.alert.startswith("clock of agent-1 is 10.98 s ahead of this one, which is too far")
 
 
 def test_statuses_that_waited_for_a_late_receiver_are_no_forgeries() -> None:

@@ -118,9 +118,21 @@ def test_the_operator_is_told_which_clock_is_farthest_off_until_it_is_set() -> N
     pair = Pair(-200_000)
     pair.exchange(20_000, 20_000)
     assert pair.clocks.alert == (
-        "clock of agent-1 is 0.20 s behind this one, which is allowed for: set the clocks of the hosts (chrony, PTP)"
+        "clock of agent-1 is 0.20 s behind this one, which is allowed for. Set the clocks of the hosts (chrony, PTP)"
     )
     pair.ahead_us = 0
     pair.exchange(20_000, 20_000)
     pair.exchange(20_000, 20_000)
     assert pair.clocks.alert == ""
+
+
+def test_a_clock_that_is_too_far_ahead_is_told_with_how_far_until_it_is_believed() -> None:
+    clocks = PeerClocks([1, 2], lambda *_, **__: None)
+    clocks.refused(1, 3_700_000_000, 100_000_000)
+    clocks.refused(2, 111_000_000, 100_000_000)
+    apart = "clock of agent-1 is 3600.00 s ahead of this one, which is too far: nothing it says is believed"
+    assert clocks.alert.startswith(apart)
+    clocks.received(1, 101_000_000, 101_000_000)
+    assert clocks.alert.startswith("clock of agent-2 is 11.00 s ahead of this one")
+    clocks.received(2, 101_000_000, 101_000_000)
+    assert clocks.alert == ""
