@@ -25,6 +25,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import unpack_tick
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
+from swarmctl.flown_code import code_in_words
 from swarmctl.ops.flight.host import refuse_unidentified, shared_run_name
 from swarmctl.ops.flight.launch import LaunchOptions, SwarmPart, judged, started
 from swarmctl.ops.orders.operator import list_setters
@@ -141,6 +142,7 @@ class SwarmWatch:
         self._ends = VouchedEnds(vouchers)
         self._died: dict[int, str] = {}  # agents whose process ended before the vehicle was down, in words
         self._own_pause = OwnPause(clock_s())
+        self._code, self._has_told_code = code_in_words(own_folder=""), False
         self.problems: list[str] = []
         self.was_stopped = self.is_over = False
 
@@ -184,8 +186,18 @@ class SwarmWatch:
             self._died[view.agent] = ended
         view.status, view.received_s = status, now_s
         self._without.update(status.without)
+        self._compare_code(status)
         if _flies(status):
             self._flying.add(status.agent)
+
+    def _compare_code(self, status: StatusMessage) -> None:
+        """Say once that an agent flies another swarmctl than this station; agents compare theirs with one another."""
+        if self._has_told_code or status.code.startswith(self._code):
+            return
+        self._has_told_code = True
+        theirs = status.code or "an older swarmctl"
+        text = f"{agent_name(status.agent)} flies {theirs}, and {self._code} judges here: verdicts may differ"
+        self._say("other_code", text, agent=status.agent, theirs=status.code, own=self._code)
 
     def _keep_obstacles(self) -> None:
         """Repeat the list of obstacles, record what hosts keep clear of, and say what operators have to know."""

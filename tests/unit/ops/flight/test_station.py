@@ -24,6 +24,7 @@ from swarmctl.bus.topics import ENDED, EVENT, OBSTACLES, STATUS, TICK
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
+from swarmctl.flown_code import code_in_words
 from swarmctl.ops.flight.station import SwarmWatch
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.telemetry.evaluation.referee import Rules, evaluate
@@ -33,6 +34,7 @@ from swarmctl.wall_clock import WallClock
 from tests.builders import status_message
 from tests.unit.telemetry.test_referee import run, ticks
 
+HERE = code_in_words(own_folder="")  # what this station runs
 BALL = Obstacle(center_ned_m=(5.0, 0.0, -2.0), radius_m=0.5, keep_out_m=1.0)
 
 
@@ -131,6 +133,7 @@ class Watched:
         starts: int = 1,
         outcome: str = "completed",
         without: tuple[int, ...] = (),
+        code: str = HERE,
     ) -> bool:
         """Return whether the station ends while agents report these phases; the others are silent.
 
@@ -141,11 +144,12 @@ class Watched:
             starts: which process of theirs it is.
             outcome: of those that are done.
             without: peers that they do not wait for.
+            code: that they fly.
         """
         for _ in range(round(seconds / 0.2)):
             for agent, phase in phases.items():
                 status = status_message(agent=agent, phase=phase)
-                status = msgspec.structs.replace(status, boot_id=starts, without=without)
+                status = msgspec.structs.replace(status, boot_id=starts, without=without, code=code)
                 done = msgspec.structs.replace(status, armed=False, outcome=outcome)
                 status = done if phase == Phase.DONE else msgspec.structs.replace(status, armed=armed, outcome="")
                 self._agents[agent].publish(STATUS, encode_message(status))
@@ -232,6 +236,21 @@ def test_ctrl_c_names_nobody_who_is_unheard_for_a_moment(watched: Watched) -> No
     assert not watched.run(4.0, {0: Phase.TRACK})
     watched.watch.close()
     assert watched.watch.problems == []
+
+
+@pytest.mark.parametrize(
+    ("code", "told"),
+    [
+        (HERE, ""),
+        (f"{HERE} with own modules 9be41f07", ""),  # a station has none
+        ("swarmctl 0.1.0 (5d0c2a11)", "agent-0 flies swarmctl 0.1.0 (5d0c2a11), and "),
+        ("", "agent-0 flies an older swarmctl, and "),
+    ],
+)
+def test_a_station_says_once_that_agents_fly_another_swarmctl(watched: Watched, code: str, told: str) -> None:
+    watched.run(2.0, ALL_TRACK, code=code)
+    assert [event for event, _ in watched.noted if event == "other_code"] == (["other_code"] if told else [])
+    assert told in watched.said.getvalue()
 
 
 def test_nobody_is_lost_while_the_station_itself_stands_still(watched: Watched) -> None:
