@@ -59,6 +59,7 @@ from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.discovery.own import OwnError
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.ordered_sums import dot
 from swarmctl.core.params import FARTHEST_M, Params
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.geofence import GeofenceParams
@@ -121,7 +122,7 @@ class Config(Params):
         """Return the start position of every agent, shared NED [m]."""
         if self.start.positions_ned_m:
             return self.start.positions_ned_m[: self.swarm.agents]
-        norm = math.sqrt(sum(c * c for c in self.start.direction_ned))
+        norm = math.sqrt(dot(self.start.direction_ned, self.start.direction_ned))
         unit = tuple(c / norm for c in self.start.direction_ned)
         offsets = [(i - (self.swarm.agents - 1) / 2) * self.start.spacing_m for i in range(self.swarm.agents)]
         x, y, z = self.start.center_ned_m
@@ -131,7 +132,7 @@ class Config(Params):
     def has_references(self) -> bool:
         """Tell whether every agent has a start, and the mission's keys go together, so that references are known."""
         listed, line = self.start.positions_ned_m, self.start.direction_ned
-        has_starts = len(listed) >= self.swarm.agents if listed else sum(c * c for c in line) > 0.0
+        has_starts = len(listed) >= self.swarm.agents if listed else dot(line, line) > 0.0
         near = has_starts and all(abs(c) <= FARTHEST_M for start in self.starts_ned_m() for c in start)
         return near and not any(self.mission.problems(self.swarm.agents))
 

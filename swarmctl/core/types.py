@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.ordered_sums import dot
+
 Array = NDArray[np.float64]
 NO_AGE_US = -1  # of what there is none yet
 MAX_MARGIN_M = 10.0  # limit of the margin in a path, so that one peer cannot ground all others
@@ -228,7 +230,7 @@ class AttitudeSetpoint:
         q = self.q_nb.tolist()
         if self.q_nb.shape != (4,) or not all(map(math.isfinite, q)):
             return f"quaternion {q} is not finite"
-        if abs(sum([component * component for component in q]) - 1.0) > 2e-3:
+        if abs(dot(q, q) - 1.0) > 2e-3:
             return f"quaternion {q} is not of unit length"
         if not (math.isfinite(self.thrust_01) and 0.0 <= self.thrust_01 <= 1.0):
             return f"thrust {self.thrust_01} is outside 0..1"

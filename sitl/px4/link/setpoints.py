@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from sitl.vehicle_parts import IDLE, Command
+from swarmctl.core.ordered_sums import dot
 
 NO_ROLL_RATE, NO_PITCH_RATE, NO_YAW_RATE = 1, 2, 4
 THRUST_BODY, NO_THRUST, NO_ATTITUDE = 32, 64, 128
@@ -103,7 +104,7 @@ class OffboardStream:
             self.command = Command(q_nb=IDLE.q_nb, thrust_01=thrust, rate_frd_rad_s=asked, stopped=stopped)
             self.echo = _LEVEL, abs(thrust_01), asked
             return
-        size = math.sqrt(sum(c * c for c in q_nb))
+        size = math.sqrt(dot(q_nb, q_nb))
         self._bad = not (math.isfinite(size) and size > 0.0)
         loose = self.poisoned or self._bad
         q_unit = IDLE.q_nb if loose else np.array(q_nb, dtype=np.float64) / size
@@ -136,7 +137,7 @@ def _complaint(type_mask: int, q_nb: Sequence[float], rates: Triple, thrust_01: 
         return "not_finite"
     if type_mask & NO_ATTITUDE:
         return ""
-    size = sum(c * c for c in q_nb)
+    size = dot(q_nb, q_nb)
     if not math.isfinite(size):
         return "not_finite"
     return "zero_quaternion" if size < 1e-12 else ""

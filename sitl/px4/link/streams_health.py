@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import development as mav
 from sitl.px4.link.schedule import CURRENT_EVENT_SEQUENCE, ESC_INFO, ESC_STATUS, LINK_NODE_STATUS, SENSOR_FUSION
 from sitl.px4.link.streams import FLIGHT_STREAMS, NAN, Fields, LinkCounts, Report, Stream, home_z_m, int32, ms
 from sitl.px4.settling import claimed, unaided_m
+from swarmctl.core.ordered_sums import ordered_sum
 
 _SENSORS_PRESENT = 0x0300C02F
 _SENSORS_ENABLED = 0x0301C02F
@@ -121,7 +122,7 @@ def esc_status(r: Report) -> Fields:
 
 
 def vibration(r: Report) -> Fields:
-    shake = 0.01 + 0.02 * sum(r.rotor_01())
+    shake = 0.01 + 0.02 * ordered_sum(r.rotor_01())
     return r.estimate.t_us, shake, shake, shake, 0, 0, 0
 
 

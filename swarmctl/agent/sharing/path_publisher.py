@@ -21,6 +21,7 @@ from swarmctl.control.estimation.flown_by_others import (
 )
 from swarmctl.control.estimation.gust import GustWatch
 from swarmctl.core.autopilot_stop import ANSWER_S, BRAKE_M_S2
+from swarmctl.core.ordered_sums import ordered_sum
 from swarmctl.core.trajectory import grid
 from swarmctl.core.types import MAX_MARGIN_M, Array, FlightMode, Plan, PredictedPath, VehicleState
 
@@ -82,7 +83,7 @@ class PathPublisher:
             self._gust.update(self._ports.clock.now_us(), disturbance_ned_m_s2)
         if state is None or (flown is None and not (self._is_recent(state) or self._coasts(state))):
             return
-        margin_m, now_us = sum((*margins_m, self._gust.margin_m)), self._ports.clock.now_us()
+        margin_m, now_us = ordered_sum((*margins_m, self._gust.margin_m)), self._ports.clock.now_us()
         is_known = as_committed and flown is not None and margin_m == self._margin_m
         if is_known and now_us - self._published_us < _COMMITTED_EVERY_US:
             return

@@ -10,6 +10,8 @@ import math
 from collections.abc import Sequence
 from typing import TypeAlias
 
+from swarmctl.core.ordered_sums import dot
+
 Vector: TypeAlias = tuple[float, ...]
 Row: TypeAlias = tuple[Vector, float]  # normal (n,) and offset of `normal . x >= offset`
 
@@ -21,8 +23,8 @@ def project(wanted: Vector, rows: Sequence[Row]) -> Vector | None:
     """Return the x (n,) nearest to `wanted` (n,) with `normal . x >= offset` for every row; None if there is none."""
     found = wanted
     for i, (normal, offset) in enumerate(rows):
-        length = math.sqrt(sum(c * c for c in normal))
-        short = offset - sum(map(_product, normal, found))
+        length = math.sqrt(dot(normal, normal))
+        short = offset - dot(normal, found)
         if short <= _EPS * max(1.0, length):
             continue
         if length < _PARALLEL:
@@ -56,7 +58,7 @@ def project_or_violate_least(wanted: Vector, soft: Sequence[Row], hard: Sequence
 
 def _project_onto_plane(wanted: Vector, unit: Vector, offset: float, rows: Sequence[Row]) -> Vector | None:
     """Project as `project` does, within the plane `unit . x = offset`."""
-    shift = offset - sum(map(_product, unit, wanted))
+    shift = offset - dot(unit, wanted)
     foot = tuple(w + shift * u for w, u in zip(wanted, unit, strict=True))
     if len(wanted) == 1:
         kept = all(o - n[0] * foot[0] <= _EPS * max(1.0, abs(n[0])) for n, o in rows)
@@ -64,10 +66,10 @@ def _project_onto_plane(wanted: Vector, unit: Vector, offset: float, rows: Seque
     mirror, scale = _mirror(unit)
     flat: list[Row] = []
     for normal, row_offset in rows:
-        along = scale * sum(map(_product, mirror, normal))
+        along = scale * dot(mirror, normal)
         inside = tuple(n - along * m for n, m in zip(normal[1:], mirror[1:], strict=True))
-        left = row_offset - sum(map(_product, normal, foot))
-        size = math.sqrt(sum(c * c for c in inside))
+        left = row_offset - dot(normal, foot)
+        size = math.sqrt(dot(inside, inside))
         if size < _PARALLEL:
             if left > _EPS:
                 return None
@@ -76,7 +78,7 @@ def _project_onto_plane(wanted: Vector, unit: Vector, offset: float, rows: Seque
     found = project((0.0,) * (len(wanted) - 1), flat)
     if found is None:
         return None
-    along = scale * sum(map(_product, mirror[1:], found))
+    along = scale * dot(mirror[1:], found)
     return tuple(f + x - along * m for f, x, m in zip(foot, (0.0, *found), mirror, strict=True))
 
 
@@ -84,8 +86,4 @@ def _mirror(unit: Vector) -> tuple[Vector, float]:
     """Return m (n,) and scale of the Householder reflection x - scale (m . x) m that maps `unit` to the first axis."""
     first = unit[0] + math.copysign(1.0, unit[0])
     mirror = (first, *unit[1:])
-    return mirror, 2.0 / sum(c * c for c in mirror)
-
-
-def _product(a: float, b: float) -> float:
-    return a * b
+    return mirror, 2.0 / dot(mirror, mirror)
