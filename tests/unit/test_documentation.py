@@ -8,6 +8,8 @@ import re
 import runpy
 import tomllib
 from collections.abc import Iterator
+from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -31,6 +33,7 @@ QUOTED = re.compile(r"`([^`\s]+)`")
 PACKAGES = "|".join(path.parent.name for path in (ROOT / "swarmctl").glob("*/__init__.py"))
 IN_PACKAGE = re.compile(rf"({PACKAGES})(\.[a-z]\w*)+")  # a module by its name within the bridge
 FOLDERS = ("swarmctl/", "sitl/", "tests/", "tools/", "configs/", "docs/")
+_HAS_STATEMENTS = ast.stmt, ast.ExceptHandler, ast.match_case  # expressions, most of a tree, have no docstrings
 PLUG_INS = {"swarmctl/control/controllers/", "swarmctl/control/reference/kinds/", "swarmctl/mavlink/dialects/"}
 
 
@@ -106,17 +109,23 @@ def test_files_and_modules_that_docstrings_quote_exist() -> None:
     keys = {key.path for section in sections() for key in section.keys}
     missing = set()
     for path in (path for folder in ("swarmctl", "sitl", "tests", "tools") for path in (ROOT / folder).rglob("*.py")):
-        quoted = {name for text in docstrings(path) for name in QUOTED.findall(text)} - keys - {RECORDING}
+        source = path.read_text()
+        if not QUOTED.search(source):
+            continue
+        quoted = {name for text in docstrings(source) for name in QUOTED.findall(text)} - keys - {RECORDING}
         names = {f"swarmctl.{name}" if IN_PACKAGE.fullmatch(name) else name for name in quoted}
         missing |= {(path.name, name) for name in names if is_ours(name) and not (exists(name) or is_in_module(name))}
     assert missing == set()
 
 
-def docstrings(path: Path) -> Iterator[str]:
-    """Yield the docstrings of a file: of the module, its classes and functions."""
-    for node in ast.walk(ast.parse(path.read_text())):
+def docstrings(source: str) -> Iterator[str]:
+    """Yield the docstrings of a module, its classes and functions."""
+    nodes: list[ast.AST] = [ast.parse(source)]
+    while nodes:
+        node = nodes.pop()
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
             yield ast.get_docstring(node) or ""
+        nodes += (child for child in ast.iter_child_nodes(node) if isinstance(child, _HAS_STATEMENTS))
 
 
 def is_in_module(name: str) -> bool:
@@ -175,7 +184,14 @@ def exists(name: str) -> bool:
             or is_for_scripts(name)
             or name.removeprefix("sitl.").partition(".")[0] in SitlParams.model_fields
         )
-    return any(ROOT.glob(name.rstrip("/"))) or ("/" not in name and any(ROOT.glob(f"*/**/{name}")))
+    return any(ROOT.glob(name.rstrip("/"))) or ("/" not in name and any(fnmatch(file, name) for file in file_names()))
+
+
+@cache
+def file_names() -> frozenset[str]:
+    """Return the names of all files of the tree, without environments and the like, which are hidden."""
+    folders = (folder for folder in ROOT.iterdir() if folder.is_dir() and not folder.name.startswith("."))
+    return frozenset(path.name for folder in folders for path in folder.rglob("*"))
 
 
 def is_for_scripts(name: str) -> bool:

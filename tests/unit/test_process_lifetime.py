@@ -85,7 +85,7 @@ def test_a_child_whose_launcher_lives_goes_on() -> None:
 def test_files_of_the_current_folder_take_the_place_of_no_module(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A `queue.py` beside an own controller: pyarrow could not be imported, so that nothing flew, or had no view."""
+    """A `queue` beside an own controller: pyarrow could not be imported, so that nothing flew, or had no view."""
     (tmp_path / "queue.py").write_text("raise SystemExit('imported')\n")
     monkeypatch.chdir(tmp_path)
     command = module_command("sitl.simulate", "--help")
