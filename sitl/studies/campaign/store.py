@@ -114,7 +114,7 @@ class Store(RowStore[Trial]):
 
 def _read(path: Path, names: Sequence[str]) -> list[Row]:
     try:
-        table = pq.read_table(pa.BufferReader(read_file(path, _MAX_BYTES)))
+        table = pq.ParquetFile(pa.BufferReader(read_file(path, _MAX_BYTES))).read(use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise ConfigError(str(path), [f"can't be read ({error}); give another --out"]) from error
     if table.schema.names != names:

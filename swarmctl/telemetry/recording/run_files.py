@@ -245,7 +245,8 @@ def read_parquet(path: Path, columns: Sequence[StoredColumn] = COLUMNS) -> NDArr
 def _stored_rows(file: Any, columns: Sequence[StoredColumn]) -> NDArray[np.void]:
     known = set(file.schema_arrow.names)
     stored = {column.name: _stored_parts(column, known) for column in columns}
-    table = file.read(columns=[part for parts in stored.values() for part in parts])
+    # Arrow's threads, once started, abort a process that ends soon after: "terminate called", exit code 134
+    table = file.read(columns=[part for parts in stored.values() for part in parts], use_threads=False)
     rows = np.zeros(table.num_rows, dtype_of(columns))
     for column in columns:
         values = [table.column(part).to_numpy() for part in stored[column.name]]
