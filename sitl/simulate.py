@@ -25,11 +25,12 @@ from swarmctl.files import replace_bytes, write_each
 from swarmctl.ops.flight.summary import draw_recording, summary_lines, unwritten_line, violation_lines
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.telemetry.recording.file_names import OUTCOME, RECORDING, TRUTH, events_file, ticks_file
+from swarmctl.telemetry.recording.file_names import RECORDING, TRUTH, events_file, ticks_file
 from swarmctl.telemetry.recording.run_folder import (
     Outcome,
     create_run_folder,
     finish_run,
+    forget_outcome,
     held_run,
     write_config,
 )
@@ -39,7 +40,7 @@ from swarmctl.wall_clock import utc_us
 
 def simulate(config: Config, directory: Path) -> int:
     """Fly `config` in lockstep into the run folder `directory` and return the exit code."""
-    write_config(directory, dump(config))
+    write_config(directory, dump(config), "lockstep")
     with held_run(directory):
         return _simulate(config, directory)
 
@@ -78,7 +79,7 @@ def _simulate(config: Config, directory: Path) -> int:
     )
     summary, unwritten = finished.summary, (*gone, *finished.unwritten)
     if gone:
-        (directory / OUTCOME).unlink(missing_ok=True)  # of what is left no report can say how it ended
+        forget_outcome(directory, "lockstep")  # of what is left no report can say how it ended
     if not unwritten:
         draw_recording(config, directory)
         optimize_recording(directory)

@@ -11,7 +11,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import tomli_w
@@ -67,7 +67,7 @@ from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.own_modules import locate, make_importable, own_problems
 from swarmctl.signing_keys import key_problems, locate_identities, locate_keys
 from swarmctl.simulator_config import EVERY_VEHICLE, OriginParams, SimulatorConfig, SimulatorParams
-from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunMode
 
 NO_VALUES: Mapping[str, Any] = MappingProxyType({})
 _NUMBERS = re.compile(r"\[\n((?: +[-+.\w]+,\n)+) *\]")  # an array of numbers as tomli_w writes it: one on each line
@@ -190,7 +190,7 @@ class Config(Params):
         """Return the down coordinate of the simulator's ground; None for real vehicles, whose ground is unknown."""
         return self.sitl.ground_z_m if self.sitl.enabled else None
 
-    def rules(self, mode: Literal["realtime", "lockstep"] = "realtime") -> Rules:
+    def rules(self, mode: RunMode = "realtime") -> Rules:
         """Return the rules by which the referee judges this run."""
         return Rules(
             agents=self.swarm.agents,

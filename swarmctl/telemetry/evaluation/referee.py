@@ -43,6 +43,7 @@ from swarmctl.telemetry.evaluation.tracks import (
 )
 from swarmctl.telemetry.evaluation.unrecorded import unrecorded
 
+RunMode = Literal["realtime", "lockstep"]
 SUMMED_ERROR = "distances of all agents to their reference, added up; mean over the mission"  # what `index_m` is
 STEADY_AFTER_S = 10.0  # mission time from which `steady_rmse_m` and `index_after_10s_m` are computed
 _MAX_LISTED = 10  # largest number of violations of one kind listed in full
@@ -70,7 +71,7 @@ class Rules:
     deadline_misses_01: float = 0.2  # largest fraction of due ticks, flown or skipped, that may be late, also of one
     solver_name: str = "osqp"
     solver_retry: str = "osqp"  # solves what that one does not finish
-    mode: Literal["realtime", "lockstep"] = "realtime"
+    mode: RunMode = "realtime"
     duration_s: float | None = None  # mission time that a completed run must have tracked
     volume: FlightVolume | None = None  # that nobody may leave
     ground_z_m: float | None = None  # down coordinate of the simulator's ground

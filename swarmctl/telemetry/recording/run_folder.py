@@ -22,7 +22,7 @@ from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import hold, is_held, replace_bytes, replace_text, write_each
-from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
+from swarmctl.telemetry.evaluation.referee import Rules, RunData, RunMode, evaluate
 from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.recording.file_names import (
     AGENT_FILE,
@@ -110,8 +110,13 @@ def _claim(base: Path) -> Path:
     return base
 
 
-def write_config(directory: Path, text: str) -> None:
+def write_config(directory: Path, text: str, mode: RunMode = "realtime") -> None:
     """Write the resolved configuration of a new run into its folder, and keep room there for how it ends.
+
+    Args:
+        directory: the run folder.
+        text: the configuration.
+        mode: how it is flown, which a run that is cut off could not tell later.
 
     Raises:
         ConfigError: another configuration is there, which may be the user's own.
@@ -121,7 +126,7 @@ def write_config(directory: Path, text: str) -> None:
     if path.exists() and path.read_text(encoding="utf-8", errors="replace") != text:
         raise ConfigError(f"--run-dir {directory}", [f"holds another {CONFIG}. Choose a new folder or move that file"])
     replace_text(path, text)
-    replace_bytes(directory / OUTCOME, b" " * _OUTCOME_BYTES)
+    replace_bytes(directory / OUTCOME, _padded({"mode": mode}))
 
 
 @contextlib.contextmanager
@@ -143,9 +148,15 @@ class Outcome:
 
 
 class _KeptOutcome(msgspec.Struct):
-    outcome: Annotated[str, msgspec.Meta(pattern="^(completed|failed|interrupted)$")]
-    problems: list[str]
+    """How a run ended: unless it says otherwise, it was cut off."""
+
+    outcome: Annotated[str, msgspec.Meta(pattern="^(completed|failed|interrupted)$")] = "failed"
+    problems: list[str] = msgspec.field(default_factory=lambda: ["the launcher did not finish this run"])
     speed_factor: float | None = None
+    mode: RunMode = "realtime"
+
+    def as_outcome(self) -> Outcome:
+        return Outcome(outcome=self.outcome, problems=tuple(self.problems), speed_factor=self.speed_factor)
 
 
 class Finished(NamedTuple):
@@ -185,36 +196,49 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
     }
     unwritten = write_each(writers)
     if unwritten:
-        _keep_outcome(directory, outcome)
+        _keep_outcome(directory, outcome, rules.mode)
     else:
         (directory / OUTCOME).unlink(missing_ok=True)
     return Finished(summary, unwritten)
 
 
-def _keep_outcome(directory: Path, outcome: Outcome) -> None:
+def _keep_outcome(directory: Path, outcome: Outcome, mode: RunMode) -> None:
     """Write how a run ended into the room that was kept for it, which a full disk has still."""
     problems, shown = [problem[:_PROBLEM_CHARACTERS] for problem in outcome.problems], len(outcome.problems)
     while True:
         told = [*problems[:shown], *([f"and {len(problems) - shown} more"] if shown < len(problems) else [])]
-        kept = _KeptOutcome(outcome=outcome.outcome, problems=told, speed_factor=outcome.speed_factor)
-        content = to_json(msgspec.to_builtins(kept)).encode()
+        kept = _KeptOutcome(outcome=outcome.outcome, problems=told, speed_factor=outcome.speed_factor, mode=mode)
+        content = _padded(msgspec.to_builtins(kept))
         if len(content) <= _OUTCOME_BYTES or not shown:
             break
         shown //= 2
+    _fill_outcome(directory, content)
+
+
+def forget_outcome(directory: Path, mode: RunMode) -> None:
+    """Leave of how a run ended what a run that was cut off has: how it was flown."""
+    _fill_outcome(directory, _padded({"mode": mode}))
+
+
+def _padded(kept: Mapping[str, Any]) -> bytes:
+    return to_json(kept).encode().ljust(_OUTCOME_BYTES)
+
+
+def _fill_outcome(directory: Path, content: bytes) -> None:
+    """Write into the room that was kept, if it still is."""
     with contextlib.suppress(OSError):
         fd = os.open(directory / OUTCOME, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
         with os.fdopen(fd, "wb") as file:
-            file.write(content.ljust(_OUTCOME_BYTES))
+            file.write(content)
 
 
-def _kept_outcome(directory: Path) -> Outcome:
+def _kept_outcome(directory: Path) -> _KeptOutcome:
     """Return how a run ended whose files the disk did not take; that it was cut off, where nothing is known of it."""
     text = read_text(directory / OUTCOME).strip()
     try:
-        kept = msgspec.json.decode(text, type=_KeptOutcome)
+        return msgspec.json.decode(text, type=_KeptOutcome)
     except (msgspec.MsgspecError, UnicodeEncodeError):
-        return Outcome(outcome="failed", problems=("the launcher did not finish this run",))
-    return Outcome(outcome=kept.outcome, problems=tuple(kept.problems), speed_factor=kept.speed_factor)
+        return _KeptOutcome()
 
 
 def report_run(directory: Path, rules: Rules) -> Path:
@@ -228,9 +252,10 @@ def report_run(directory: Path, rules: Rules) -> Path:
         raise ConfigError(str(directory), [f"holds a campaign or a sweep, whose page is {REPORT}, and no run"])
     if read_summary(directory) is None:
         _refuse_recorded(directory)
-        run, outcome = load_run(directory), _kept_outcome(directory)
+        run, kept = load_run(directory), _kept_outcome(directory)
+        outcome = kept.as_outcome()
         problems = (*outcome.problems, *_cut_off(run, outcome))
-        finished = finish_run(directory, rules, replace(outcome, problems=problems), run)
+        finished = finish_run(directory, replace(rules, mode=kept.mode), replace(outcome, problems=problems), run)
         if finished.unwritten:
             raise StartError(f"{directory}: can't be written: {'; '.join(finished.unwritten)}")
         return directory / REPORT

@@ -32,6 +32,10 @@ def test_a_full_disk_costs_the_files_and_not_the_verdict(tmp_path: Path) -> None
     assert lines[-1].count("agent-0.ticks: File too large") == 1
     assert "What of truth.bin, agent-0.ticks was not written is lost" in lines[-1]
     assert "swarmctl report" not in lines[-1], "the rows were in memory"
+    (tmp_path / "run" / "summary.json").unlink()
+    report_run(tmp_path / "run", Rules(agents=1, required_separation_m=0.5))
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["outcome"], summary["mode"]) == ("failed", "lockstep")
 
 
 def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -272,6 +273,16 @@ def test_report_of_a_run_whose_launcher_died_says_so(tmp_path: Path) -> None:
     assert summary["violations"] == ["the launcher did not finish this run"]
 
 
+def test_a_simulation_that_was_cut_off_is_judged_as_one(tmp_path: Path) -> None:
+    """Programs tell simulations from flights by `mode`."""
+    write_config(tmp_path, "", "lockstep")
+    write_run(tmp_path, 3, 6.0)
+    report_run(tmp_path, RULES)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["mode"] == "lockstep"
+    assert summary["violations"] == ["the launcher did not finish this run"]
+
+
 def full_disk(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -290,10 +301,10 @@ def test_how_a_run_ended_is_known_once_there_is_room(
     with monkeypatch.context() as disk:
         for writer in ("replace_text", "write_parquet", "write_report"):
             disk.setattr(run_folder, writer, full_disk)
-        assert finish_run(tmp_path, RULES, outcome).unwritten
+        assert finish_run(tmp_path, replace(RULES, mode="lockstep"), outcome).unwritten
     report_run(tmp_path, RULES)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["outcome"] == outcome.outcome
+    assert (summary["outcome"], summary["mode"]) == (outcome.outcome, "lockstep")
     assert summary["violations"][:1] == list(problems[:1])
     assert not (tmp_path / OUTCOME).exists()
 
