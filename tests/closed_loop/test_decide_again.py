@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import struct
 from collections.abc import Callable
@@ -125,6 +126,15 @@ def test_obstacles_that_were_set_in_flight_are_known(folder: Path, tmp_path: Pat
     assert sum('"obstacles_changed"' in line for line in lines) == 4, "two lists, of two agents"
     (bare / "events.jsonl").write_text("".join(line for line in lines if '"obstacles_changed"' not in line))
     assert sum(found.ticks for agent in decisions_of_run(bare, ()) for found in agent.differences) > 10
+
+
+def test_frames_that_are_lost_are_named(folder: Path, tmp_path: Path) -> None:
+    """A `.tlog` that a full disk has cut off looked like an agent that decides otherwise."""
+    cut = shutil.copytree(folder, tmp_path / "cut")
+    log = (cut / "agent-0.tlog").read_bytes()
+    (cut / "agent-0.tlog").write_bytes(log[: len(log) // 2])
+    (note,) = notes_of_run(cut)
+    assert re.match(r"agent-0: agent-0\.tlog lacks \d+ of \d+ frames that its ticks received", note)
 
 
 def test_who_has_recorded_no_ticks_or_was_killed_is_named(folder: Path, tmp_path: Path) -> None:

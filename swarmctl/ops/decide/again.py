@@ -73,6 +73,22 @@ class _Rows:
         """Forget it."""
 
 
+def recorded_frames(directory: Path, agent: int) -> list[tuple[int, bytes]]:
+    """Return the frames that an agent's vehicle has sent, each with its UTC [us], as far as its `.tlog` is readable.
+
+    Raises:
+        ConfigError: it can't be read, or holds none.
+    """
+    path = directory / frames_file(agent)
+    try:
+        frames = list(frames_of(read_file(path, _MOST_TLOG_BYTES)))
+    except OSError as error:
+        raise ConfigError(str(path), [f"can't be read: {error.strerror or error}"]) from error
+    if not frames:
+        raise ConfigError(str(path), ["holds no frames of a vehicle"])
+    return frames
+
+
 def decide_again(directory: Path, config: Config, recording: Recording, agent: int) -> NDArray[np.void]:
     """Return the ticks (T,) of an agent that receives what it has received, by a configuration that may be another.
 
@@ -81,13 +97,7 @@ def decide_again(directory: Path, config: Config, recording: Recording, agent: i
     """
     if config.separation.mode == "guaranteed":
         raise ConfigError("--decide", ["separation.mode = 'guaranteed': what agents committed to is not recorded"])
-    path = directory / frames_file(agent)
-    try:
-        frames = list(frames_of(read_file(path, _MOST_TLOG_BYTES)))
-    except OSError as error:
-        raise ConfigError(str(path), [f"can't be read: {error.strerror or error}"]) from error
-    if not frames:
-        raise ConfigError(str(path), ["holds no frames of a vehicle"])
+    frames = recorded_frames(directory, agent)
     clock, link = RecordedTime(), RecordedLink()
     ticks = recording.run.ticks
     bus = RecordedBus(frozenset(agent_name(number) for number in ticks))

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.config import load, load_recorded
+from swarmctl.core.recorded.received import ReceivedKind
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
-from swarmctl.ops.decide.again import Decisions, compare, decide_again
+from swarmctl.ops.decide.again import Decisions, compare, decide_again, recorded_frames
 from swarmctl.ops.decide.deliveries import Recording
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.evaluation.tracks import flight_rows
-from swarmctl.telemetry.recording.file_names import CONFIG
+from swarmctl.telemetry.recording.file_names import CONFIG, frames_file
 from swarmctl.telemetry.recording.run_files import load_run, read_plans, read_received
 
 _SHOWN = 10  # differences of an agent, in text
@@ -65,12 +66,21 @@ def notes_of_run(directory: Path) -> list[str]:
         if rows is None:
             notes.append(f"{name}: no ticks were recorded; what it has said is not known to the others, nor compared")
             continue
-        if not len(read_received(directory, agent)):
+        received = read_received(directory, agent)
+        if not len(received):
             notes.append(f"{name}: an older recording, without what each tick received: it is guessed by stamps")
+        elif lost := _lost_frames(received, len(recorded_frames(directory, agent))):
+            notes.append(f"{name}: {frames_file(agent)} lacks {lost}: without them it decides otherwise")
         if len(flight_rows(rows[-1:])):
             phase = Phase(int(rows["phase"][-1])).name
             notes.append(f"{name}: its ticks end in {phase}; how others noticed is not replayed: they may differ")
     return notes
+
+
+def _lost_frames(received: NDArray[np.void], there: int) -> str:
+    """Return how many frames that ticks have received are not there; "" if all are."""
+    frames = int(received["seq"][received["kind"] == ReceivedKind.FRAMES].sum())
+    return f"{frames - there} of {frames} frames that its ticks received" if there < frames else ""
 
 
 def _recorded(run: RunData) -> dict[int, NDArray[np.void]]:
