@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from swarmctl.core.text import printable, printable_lines
-from swarmctl.standard_streams import prepare_standard_streams
+from swarmctl.standard_streams import finish_output, prepare_standard_streams
 
 EXIT_OK = 0
 EXIT_USAGE = 2
@@ -49,8 +49,19 @@ class MissionError(SwarmError):
 
 
 def exit_code_of(run: Callable[[], int], when_interrupted: str = "") -> int:
-    """Run `run` and return its exit code; errors go to standard error, Ctrl-C gives `EXIT_INTERRUPTED`."""
+    """Run `run` and return its exit code; errors go to standard error, Ctrl-C gives `EXIT_INTERRUPTED`.
+
+    Success is `EXIT_MISSION` where the disk had no room for what was printed.
+    """
     prepare_standard_streams()
+    code = _reported(run, when_interrupted)
+    if problem := finish_output():
+        print(problem, file=sys.stderr)
+        return code or EXIT_MISSION
+    return code
+
+
+def _reported(run: Callable[[], int], when_interrupted: str) -> int:
     try:
         return run()
     except SwarmError as error:

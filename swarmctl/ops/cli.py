@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from swarmctl import __version__
-from swarmctl.core.text import printable_lines
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError, exit_code_of
 from swarmctl.ops.verbs.agent import add_agent_verb
 from swarmctl.ops.verbs.configuration import config_app
 from swarmctl.ops.verbs.folders import Web, add_folder_verbs, show_in_browser
@@ -27,7 +26,7 @@ from swarmctl.ops.verbs.mission import mission_app
 from swarmctl.ops.verbs.obstacles import obstacle_app
 from swarmctl.ops.verbs.orders import AsJson, Run, add_order_verbs
 from swarmctl.process_lifetime import module_command
-from swarmctl.standard_streams import prepare_standard_streams
+from swarmctl.standard_streams import output_is_lost
 
 if TYPE_CHECKING:
     from swarmctl.bus.messages.json_messages import StatusMessage
@@ -66,12 +65,7 @@ _PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True, "help_opti
 
 def main() -> None:
     """Run the command line: print expected errors and return their exit code, let unexpected ones raise."""
-    prepare_standard_streams()
-    code = _run_app()
-    try:
-        sys.stdout.flush()
-    except OSError:  # the reader has closed the pipe; the interpreter would change the exit code
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    code = exit_code_of(_run_app)
     if _bus_is_blocked():
         atexit._run_exitfuncs()
         os._exit(code)
@@ -87,11 +81,10 @@ def _bus_is_blocked() -> bool:
 def _run_app() -> int:
     try:
         code = app(standalone_mode=False)
-    except SwarmError as error:
-        print(printable_lines(str(error)), file=sys.stderr)
-        return error.exit_code
-    except (typer.Abort, KeyboardInterrupt):
+    except typer.Abort:
         return EXIT_INTERRUPTED
+    except SwarmError:
+        raise
     except Exception as error:
         show = getattr(error, "show", None)  # usage errors of whichever click typer brings
         if show is None or not hasattr(error, "exit_code"):
@@ -237,6 +230,8 @@ def _watch(launch: RunningLaunch, as_json: bool) -> None:
                 display.show(views)
             elif statuses:
                 print(operator.as_json(statuses, indent=None), flush=True)
+            if output_is_lost():
+                return
     finally:
         if display is not None:
             display.close()

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SHORT = ("--agents", "1", "--duration", "1", "--no-view", "--set", "telemetry.enabled=false", "--set", "sitl.start=air")
 
 
@@ -30,3 +32,25 @@ def test_closed_streams_change_neither_exit_code_nor_files(tmp_path: Path) -> No
     assert subprocess.run(["sh", "-c", command, sys.executable, *flight], timeout=120, check=False).returncode == 0
     recorded = [path.read_bytes() for path in (tmp_path / "run").iterdir()]
     assert recorded and not any(b"summed mean tracking error" in content[:80] for content in recorded)
+
+
+def test_a_reader_that_closes_the_pipe_ends_no_verb(tmp_path: Path) -> None:
+    """`| head` ended a sweep before its first flight in a traceback, and measurements without a file."""
+    short = ("--set", "swarm.agents=1", "--set", "sitl.start=air", "--duration", "1", "--jobs", "1")
+    sweep = ("sweep", "--set", "mission.circle.radius_m=2,3", *short, "--out", str(tmp_path))
+    for arguments, unbuffered in ((sweep, ""), (("config", "show"), ""), (("config", "show"), "1")):
+        command = ["bash", "-c", '"$0" -m swarmctl "$@" | head -0; exit ${PIPESTATUS[0]}', sys.executable, *arguments]
+        where = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+        done = subprocess.run(command, env=where, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+        assert (done.returncode, done.stderr) == (0, ""), arguments
+    assert (tmp_path / "rows.parquet").exists()
+
+
+@pytest.mark.parametrize("arguments", [("config", "show", "seed"), ("config", "schema"), ("--version",)])
+def test_a_full_disk_is_told_and_is_no_success(arguments: tuple[str, ...]) -> None:
+    """A program would read an empty file of `status --json > FILE` as the answer."""
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "swarmctl", *arguments]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert done.stderr == "standard output can't be written: No space left on device\n"
+    assert done.returncode == 4
