@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.phases.inputs import PeerInputs
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Command, FlightMode, Mode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, SECOND, START, UTC0_US, Flight, ready
 
@@ -130,6 +131,18 @@ def test_no_agent_arms_before_all_stand_by(missing: str) -> None:
     flight.armable, flight.busy = True, False
     flight.peer(Phase.STANDBY)
     assert Verb.ARM in flight.run(0.3)
+
+
+@pytest.mark.parametrize("comes", ["a peer gives up", "the mission begins", "a vehicle beside", "an obstacle above"])
+def test_what_comes_after_all_have_stood_by_still_keeps_a_vehicle_from_being_armed(comes: str) -> None:
+    flight = Flight().until(Phase.ARM)
+    if comes == "a vehicle beside":
+        flight.unsettled = "1.20 m to the next vehicle (now 0.40 m)"
+    elif comes == "an obstacle above":
+        flight.obstacles = (Obstacle(center_ned_m=tuple(START.tolist()), radius_m=1.0, keep_out_m=1.2),)
+    else:
+        flight.peer(Phase.GOTO_LAND if comes == "a peer gives up" else Phase.TRACK, UTC0_US)
+    assert flight.run(5.0) == []
 
 
 @pytest.mark.parametrize(("ground_z_m", "is_armed"), [(-2.4, True), (-2.6, True), (-2.8, False), (-8.0, False)])

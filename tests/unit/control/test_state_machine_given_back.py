@@ -57,6 +57,15 @@ def test_a_vehicle_given_back_outside_of_the_mission_is_asked_for_and_goes_on(ph
     assert flight.phase is phase
 
 
+def test_a_vehicle_that_was_had_back_lands_at_its_start() -> None:
+    flight = away(Phase.GOTO_LAND, 5.0)
+    flight.run(0.5)
+    flight.flight_mode, flight.failsafe_mode = FlightMode.EXTERNAL, Mode.TRACKING
+    flight.run(0.5)
+    flight.pos = START.copy()
+    assert flight.run(5.0)[:1] == [Verb.LAND]
+
+
 @pytest.mark.parametrize("begun", [False, True], ids=["begins_later", "has_begun"])
 def test_the_mission_is_approached_by_who_was_away_when_it_began(begun: bool) -> None:
     flight = away(Phase.READY, 5.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from swarmctl.control.phases.mission_state import TAKEN_OVER
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.control.reference.landing_places import Taken, landing_place_ned_m, nearest_in_plane_m
@@ -14,6 +15,7 @@ from tests.benches.state_machine_flight import (
     IN_AIR,
     ON_GROUND,
     START,
+    UTC0_US,
     Flight,
     controlled,
     ready,
@@ -114,6 +116,16 @@ def test_a_pilot_in_control_before_the_mission_is_not_landed_by_the_timeout(phas
     flight = Flight().until(phase)
     flight.flight_mode, flight.landed, flight.pos = FlightMode.MANUAL, IN_AIR, START.copy()
     assert flight.run(120.0) == []
+
+
+def test_a_pilot_who_comes_before_the_agent_has_control_keeps_the_vehicle_in_a_hold_of_his_own() -> None:
+    """From the autopilot's hold the agent asks for control: it must not be taken for that of its climb."""
+    flight = Flight().until(Phase.GOTO_START)
+    flight.flight_mode = FlightMode.MANUAL
+    flight.run(1.0)
+    flight.flight_mode = FlightMode.HOLD
+    assert flight.run(5.0) == []
+    assert flight.mission.outcome == TAKEN_OVER
 
 
 def test_a_pilot_override_during_handback_in_the_air_is_not_put_on_hold() -> None:
@@ -267,6 +279,14 @@ def test_a_vehicle_found_in_the_air_is_handed_back_in_the_air(landed_at_first: L
     np.testing.assert_allclose(pos[0], flight.pos, atol=1e-9)  # where the mission ends, not where it began
     assert (flight.phase, flight.mission.outcome) == (Phase.DONE, "completed")
     assert flight.armed
+
+
+def test_a_vehicle_found_in_the_air_is_not_flown_into_a_mission_that_has_begun() -> None:
+    flight = Flight()
+    flight.armed, flight.pos, flight.landed = True, START.copy(), IN_AIR
+    flight.peer(Phase.TRACK, UTC0_US)
+    assert flight.run(5.0) == []
+    assert (flight.at, flight.mission.outcome) == ("DONE", "the mission has begun without it")
 
 
 # -- bus loss ---------------------------------------------------------------------------------------------------------

@@ -42,6 +42,16 @@ def test_a_stop_between_the_acknowledgement_of_arming_and_its_heartbeat_disarms(
     assert (flight.at, flight.mission.outcome) == ("DONE", OPERATOR_STOP)
 
 
+def test_a_heartbeat_proves_nothing_while_the_request_to_arm_is_open_however_late_in_a_tick_it_arrives() -> None:
+    """It may arrive after the tick began, and still be from before the request."""
+    flight = asked_to_arm(busy=True)
+    flight.ask("land")
+    for _ in range(5):
+        flight.beat_us = flight.now_us + 1_000
+        flight.step()
+    assert flight.at == "LAND", "its motors may start yet"
+
+
 def test_a_copy_of_a_heartbeat_from_before_it_was_armed_ends_no_take_off() -> None:
     flight = Flight().until(Phase.TAKEOFF)
     flight.run(0.3)
@@ -80,8 +90,11 @@ def test_long_after_it_was_armed_one_heartbeat_suffices() -> None:
     assert flight.at == "DONE"
 
 
-def test_a_refusal_after_an_arm_request_disarms_before_giving_up() -> None:
+@pytest.mark.parametrize("mode", [FlightMode.HOLD, FlightMode.MANUAL])
+def test_a_refusal_after_an_arm_request_disarms_before_giving_up(mode: FlightMode) -> None:
+    """PX4 is armed in the mode that it is in: on the ground that is no pilot's takeover."""
     flight = asked_to_arm(busy=False)
+    flight.flight_mode = mode
     flight.refusal = "COM_OBL_RC_ACT = 7"
     assert Verb.DISARM in flight.run(1.0)
     assert flight.at == "LAND"
@@ -230,6 +243,17 @@ def test_an_agent_waiting_for_the_beginning_goes_home_when_a_peer_gives_up(phase
     flight.run(0.3)
     assert flight.phase in (Phase.GOTO_LAND, Phase.LAND), "it stands on its landing place already"
     assert "gave up" in flight.mission.outcome
+
+
+def test_an_operator_holds_it_where_it_waits_for_the_beginning_also_when_a_peer_gives_up() -> None:
+    flight = Flight().until(Phase.READY)
+    assert flight.ask("hold") == ""
+    flight.peer(Phase.GOTO_LAND)
+    flight.run(5.0)
+    assert flight.at == "READY"
+    assert flight.ask("resume") == ""
+    flight.run(0.2)
+    assert flight.phase >= Phase.GOTO_LAND
 
 
 @pytest.mark.parametrize("phase", [Phase.GOTO_START, Phase.READY, Phase.TRACK])
