@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+import select
 import sys
 from typing import TYPE_CHECKING
 
@@ -34,12 +35,14 @@ class _Output(io.RawIOBase):
     def write(self, data: ReadableBuffer, /) -> int:
         """Write all of `data`, or drop what is left of it; returns its length."""
         view = memoryview(data).cast("B")
-        try:
-            written = 0
-            while self._number not in _lost and written < len(view):
+        written = 0
+        while self._number not in _lost and written < len(view):
+            try:
                 written += os.write(self._number, view[written:])
-        except OSError as error:
-            _lost[self._number] = error
+            except BlockingIOError:  # set so by another program that has the same terminal or pipe
+                select.select((), (self._number,), ())
+            except OSError as error:
+                _lost[self._number] = error
         return len(view)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import select
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -54,3 +56,17 @@ def test_a_full_disk_is_told_and_is_no_success(arguments: tuple[str, ...]) -> No
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
     assert done.stderr == "standard output can't be written: No space left on device\n"
     assert done.returncode == 4
+
+
+def test_a_pipe_that_is_set_not_to_be_waited_for_loses_nothing() -> None:
+    """Another program that has the same terminal or pipe may set it so; what did not fit in at once was lost."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    program = "from swarmctl.standard_streams import *; prepare_standard_streams(); print('x' * 200_000)"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=write) as writer:
+        while select.select((), (write,), (), 0.0)[1] and writer.poll() is None:
+            time.sleep(0.05)  # until the pipe is full
+        os.close(write)
+        with os.fdopen(read, "rb") as reader:
+            assert len(reader.read()) == 200_001
+        assert writer.wait(60) == 0
