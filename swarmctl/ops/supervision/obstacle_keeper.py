@@ -5,6 +5,7 @@ Stamps are by the clock of the launch, as its agents have it: it follows steps o
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -18,7 +19,9 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.wall_clock import WallClock
 
 _REPEAT_US = 1_000_000
-_SAME_CLOCK_US = 500_000
+_KNOWN_BY = 3  # messages, of which one has come without delay: the clock of their sender is known then
+_KEPT = 10  # messages of each sender by which it is known, so that a step of it is noticed
+_SAME_CLOCK_US, _UNKNOWN_CLOCK_US = 50_000, 500_000  # differences that are none, of clocks that are known or not
 _CORRECTED_US = 20_000  # change of the clock after which moving obstacles are stamped anew; 2 cm at 1 m/s
 _TELL_AT = 3  # repetitions of another list, after which it is told: it may still come from its operator
 
@@ -61,6 +64,7 @@ class ObstacleKeeper:
         self.heard: ObstaclesMessage | None = None
         self._said_us: int | None = None  # None: not yet
         self._received_us = clock.now_us()
+        self._behind_us: dict[str, deque[int]] = {}  # by how much senders' clocks are behind at most, by each message
         self._newer_lists: dict[str, tuple[tuple[int, int], int]] = {}  # rank, and how often, of who is not believed
         self._others: list[str] = []
 
@@ -73,6 +77,8 @@ class ObstacleKeeper:
             if message is None or message.is_too_far_from(self.newest):
                 self._refuse(sender, OBSTACLES.name, MALFORMED if message is None else SEQUENCE)
                 continue
+            behind_us = self._clock.utc_us() - message.utc_us
+            self._behind_us.setdefault(sender, deque(maxlen=_KEPT)).append(behind_us)
             if not message.proposed and message.replaces(self.heard):
                 self.heard = message
             if not message.replaces(self.newest):
@@ -80,7 +86,7 @@ class ObstacleKeeper:
             if sender not in self._trusted:
                 self._compare(sender, message)
             else:
-                adopted.append(Adoption(before=self.newest, after=self._by_own_clock(message, waited_us)))
+                adopted.append(Adoption(before=self.newest, after=self._by_own_clock(sender, message, waited_us)))
                 self.newest, self._said_us = adopted[-1].after, None
                 self._ahead_us = self._clock.utc_ahead_us()
                 self._newer_lists.clear()
@@ -115,11 +121,16 @@ class ObstacleKeeper:
             self.newest = self.newest.shifted(ahead_us - self._ahead_us)
             self._ahead_us = ahead_us
 
-    def _by_own_clock(self, message: ObstaclesMessage, waited_us: int) -> ObstaclesMessage:
+    def _by_own_clock(self, sender: str, message: ObstaclesMessage, waited_us: int) -> ObstaclesMessage:
         """Return a list by the own clock, where its sender's is another one; it may have waited here for so long."""
-        ahead_us = self._clock.utc_us() - message.utc_us
-        same = -_SAME_CLOCK_US <= ahead_us <= _SAME_CLOCK_US + waited_us
-        return msgspec.structs.replace(message if same else message.shifted(ahead_us), proposed=False)
+        behind_us = self._behind_us[sender]
+        if len(behind_us) < _KNOWN_BY:
+            ahead_us = behind_us[-1]
+            is_same = -_UNKNOWN_CLOCK_US <= ahead_us <= _UNKNOWN_CLOCK_US + waited_us
+        else:
+            ahead_us = min(behind_us)
+            is_same = abs(ahead_us) <= _SAME_CLOCK_US
+        return msgspec.structs.replace(message if is_same else message.shifted(ahead_us), proposed=False)
 
     def _compare(self, sender: str, message: ObstaclesMessage) -> None:
         rank, count = self._newer_lists.get(sender, (message.rank, 0))
