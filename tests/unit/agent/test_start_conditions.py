@@ -126,3 +126,26 @@ def test_nobody_is_armed_among_agents_that_fly_other_code(own: str, others: dict
     for second in range(6):
         waits_for = conditions.unsettled(second * SECOND, 0.05, stands, tuple, lambda: others)
     assert waits_for == said
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "accuracy_m", "at_once", "later"),
+    [
+        (2, 0.05, "the estimator's accuracy to settle", ""),
+        (2, 2.0, "the estimator's accuracy to settle", "separation.radius_m = 0.9: body"),
+        (2, None, "the estimator to tell its accuracy", ""),
+        (1, 2.0, "", ""),
+    ],
+)
+def test_nobody_is_armed_among_others_while_an_estimate_settles_or_is_too_inaccurate_for_the_radius(
+    vehicles: int, accuracy_m: float | None, at_once: str, later: str
+) -> None:
+    setup = SimpleNamespace(**vars(SETUP) | {"starts_ned_m": np.zeros((vehicles, 3))})
+    conditions = StartConditions(
+        cast(AgentSetup, setup), cast(MissionState, SimpleNamespace(phase=Phase.STANDBY)), Alerts()
+    )
+    stands = builders.vehicle_state(landed=Landed.ON_GROUND)
+    said = [conditions.unsettled(second * SECOND, accuracy_m, stands, tuple, dict) for second in range(6)]
+    for text, expected in ((said[0], at_once), (said[-1], later)):
+        assert text.startswith(expected)
+        assert bool(text) == bool(expected)

@@ -34,7 +34,8 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER
-from swarmctl.core.types import FlightMode, Landed, Phase
+from swarmctl.core.trajectory import resting
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from tests import builders
 from tests.unit.bus.test_topics import STATUS
 
@@ -527,6 +528,17 @@ def test_only_who_runs_an_agent_says_that_it_has_ended(sender: str, peer: int, b
     assert bench.world_model.refusals.by_reason == {"malformed": 1, **({} if believed else {"identity": 1})}
 
 
+def test_an_end_counts_as_soon_as_it_is_told_though_no_peer_is_heard_any_more() -> None:
+    bench = Bench()
+    bench.say_status(phase=Phase.TRACK)
+    bench.tick()
+    assert bench.world_model.statuses.ended == set()
+    ended = EndedMessage(agent=1, boot_id=STATUS.boot_id, is_down=False)
+    bench.hub.carry("bravo", topics.ENDED, encode_message(ended))
+    bench.tick()
+    assert bench.world_model.statuses.ended == {1}
+
+
 def test_an_end_that_is_told_again_says_nothing_of_the_next_process() -> None:
     bench = Bench()
 
@@ -619,6 +631,30 @@ def test_who_is_done_or_has_left_is_no_company() -> None:
     assert bench.world_model.statuses.has_company(bench.clock.utc_us())
     bench.peer.close()
     assert not bench.world_model.statuses.has_company(bench.clock.utc_us())
+
+
+@pytest.mark.parametrize(
+    ("commits", "mode", "silent_s", "share_01"),
+    [
+        (False, Mode.TRACKING, 0.1, 0.5),
+        (False, Mode.PILOT_OVERRIDE, 0.1, 1.0),
+        (False, Mode.TRACKING, 3.0, 1.0),
+        (True, Mode.TRACKING, 0.1, 0.5),
+        (True, Mode.PILOT_OVERRIDE, 0.1, 1.0),
+    ],
+)
+def test_the_safety_filter_takes_half_of_the_avoidance_only_where_that_of_the_peer_takes_the_other_half(
+    commits: bool, mode: Mode, silent_s: float, share_01: float
+) -> None:
+    bench = Bench()
+    bench.say_path()
+    bench.say_status(phase=Phase.TRACK, mode=int(mode))
+    bench.tick()
+    bench.clock.advance(round(1e6 * silent_s))
+    committed = {1: [resting(HERE, bench.clock.utc_us(), TICK_US)]} if commits else {}
+    there = HERE + np.array([9.0, 0.0, 0.0])
+    bodies = bench.world_model.bodies(there, bench.clock.utc_us(), 0.1, 0.1, committed_peers=committed)
+    assert {body.responsibility_01 for body in bodies} == {share_01}
 
 
 @pytest.mark.parametrize(
