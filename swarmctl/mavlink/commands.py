@@ -124,7 +124,6 @@ class CommandPort:
             if not self._asked or self._spoken is None:
                 return
             self._steps.extend(self._spoken.steps(self._asked.popleft()))
-            self._tries, self._next_us = 0, now_us
         if now_us >= self._next_us:
             if self._tries == _TRIES:
                 self._finish(False, "no answer")

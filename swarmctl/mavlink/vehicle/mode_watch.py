@@ -63,7 +63,7 @@ class ModeWatch:
         if not by_heartbeat:
             self._changed_us = arrived_us
         elif mode is not self.mode and arrived_us - self._changed_us < _JUST_US and not self.in_doubt:
-            self._doubt_us = max(arrived_us, self.told_us + 1)  # what follows it decides, also at once
+            self._doubt_us = self.told_us + 1  # what follows it decides, also at once
             return
         if self.mode is FlightMode.EXTERNAL and mode is not FlightMode.EXTERNAL:
             self.departures += 1

@@ -31,6 +31,15 @@ def test_no_state_before_mode_origin_and_position_are_all_known() -> None:
     assert (state.armed, state.mode, state.failsafe) == (True, FlightMode.EXTERNAL, False)
 
 
+def test_no_state_of_a_vehicle_that_has_not_told_its_mode() -> None:
+    bench = Bench()
+    bench.say(odometry())
+    bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
+    assert bench.poll() is None
+    bench.heartbeat()
+    assert bench.poll() is not None
+
+
 def test_two_vehicles_at_one_place_with_different_local_origins_are_at_one_place() -> None:
     # the place: 30 m north, 40 m east, 10 m above the shared origin
     lat, lon, alt = pymap3d.ned2geodetic(30.0, 40.0, -10.0, SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
@@ -307,6 +316,15 @@ def test_a_change_that_a_heartbeat_and_a_mode_tell_at_once_is_believed() -> None
     bench.heartbeat(PX4_OFFBOARD)
     bench.say(dialect.MAVLink_current_mode_message(0, PX4_OFFBOARD, 0))
     assert bench.poll().mode is FlightMode.EXTERNAL
+
+
+def test_a_heartbeat_that_contradicts_a_mode_of_the_same_tick_puts_it_in_doubt() -> None:
+    bench = told(PX4_HOLD, FlightMode.HOLD, 1.0)
+    bench.say(dialect.MAVLink_current_mode_message(0, PX4_OFFBOARD, 0))
+    bench.heartbeat(PX4_HOLD)
+    assert flying(bench, 0.1, mode_hz=0.0) is None
+    bench.heartbeat(PX4_HOLD)
+    assert flying(bench, 0.02, mode_hz=0.0).mode is FlightMode.HOLD
 
 
 def test_a_failsafe_that_came_and_went_between_two_polls_is_shown_once() -> None:

@@ -162,8 +162,21 @@ def test_in_progress_is_not_an_answer_yet() -> None:
     bench = Bench()
     bench.port.request(Command(verb=Verb.LAND))
     bench.run(0.1)
-    assert bench.hear(ack(21, 5)) == []
+    for _ in range(20):  # for longer than silence is waited for
+        assert bench.hear(ack(21, 5)) == []
+        bench.run(0.5)
     assert bench.hear(ack(21, 0))[0].ok
+
+
+@pytest.mark.parametrize("verb", [Verb.PARAM_GET, Verb.PARAM_FLOAT])
+def test_what_is_said_of_another_parameter_is_no_answer(verb: Verb) -> None:
+    bench = Bench()
+    bench.port.request(Command(verb=verb, name="COM_OF_LOSS_T", value=0.5))
+    bench.run(0.1)
+    assert bench.hear(param_value("COM_RC_LOSS_T", 0.5)) == []
+    assert bench.hear(dialect.MAVLink_param_error_message(5, 191, b"COM_RC_LOSS_T", -1, 1)) == []
+    (answer,) = bench.hear(param_value("COM_OF_LOSS_T", 0.5))
+    assert answer.ok
 
 
 def test_the_answer_to_something_else_is_not_ours() -> None:
