@@ -57,6 +57,19 @@ def test_who_is_landed_without_a_position_is_done_and_has_not_completed(
     assert (flight.phase, flight.mission.outcome) == (Phase.DONE, "pilot or autopilot took over")
 
 
+@pytest.mark.parametrize("phase", CONTROLLED_PHASES)
+def test_a_reboot_that_is_told_seconds_after_its_positions_ended_is_called_one(phase: Phase) -> None:
+    flight = controlled(phase)
+    flight.failsafe_mode = Mode.STATE_STALE
+    for armed in (False, True, False):  # a copy of an old HEARTBEAT in between
+        flight.armed = armed
+        flight.run(2.0)
+    assert flight.mission.had_control
+    flight.boots = 1
+    flight.run(2.0)
+    assert flight.mission.outcome == REBOOTED
+
+
 STOPPED = "overload: setpoints stopped 0.5 s (26 deadline misses, 2078 since the start)"
 
 
