@@ -30,7 +30,6 @@ _PROPOSAL = struct.Struct("<Qq")  # number, time of proposal
 _TRAJECTORY = struct.Struct("<qiH2x")
 _ACKNOWLEDGEMENT = struct.Struct("<IQ")
 _HEARD = struct.Struct("<Iqq")
-_HEARD_DTYPE = np.dtype([("agent", "<u4"), ("stamp_us", "<i8"), ("arrival_us", "<i8")])
 _AGENT = struct.Struct("<I")
 
 Memory = dict[bytes, Trajectory]  # decoded trajectories by their bytes
@@ -49,8 +48,7 @@ class HeardTimes(Mapping[int, tuple[int, int]]):
     @property
     def oldest_us(self) -> int:
         """Return the earliest arrival of all; 0 if nobody was heard."""
-        arrivals = np.frombuffer(self._encoded, _HEARD_DTYPE)["arrival_us"]
-        return int(arrivals.min()) if len(arrivals) else 0
+        return min([arrival for _, _, arrival in _HEARD.iter_unpack(self._encoded)], default=0)
 
     def __getitem__(self, agent: int) -> tuple[int, int]:
         key = _AGENT.pack(agent)

@@ -120,8 +120,12 @@ def missed(
     ahead_us: int = 0,
     far_us: int = 0,
     far: frozenset[int] = frozenset(),
+    unheard: int = 0,
 ) -> list[int]:
-    """Return what `own` passes on to agent 1, which says of whom it has `heard`; all but agent 1 have heard agent 2."""
+    """Return what `own` passes on to agent 1, which says of whom it has `heard`; all but agent 1 have heard agent 2.
+
+    Besides there are agents of which `own` has heard nothing.
+    """
     known = dict.fromkeys((0, 1, 2, *helpers), (NEWEST_US, NOW_US))
     newest = {
         1: replace(message(1, sent_us=NOW_US + ahead_us, heard=heard), reach=Reach(far=far)),
@@ -130,7 +134,15 @@ def missed(
     }
     arrivals_us = dict.fromkeys(newest, NOW_US) | {1: received_us}
     return missed_by_peers(
-        own, newest, newest, arrivals_us, NOW_US, period_us=period_us, far_us=far_us, lacked_us=lambda *_: lacked_us
+        own,
+        newest,
+        newest,
+        arrivals_us,
+        NOW_US,
+        peers=len(newest) + unheard,
+        period_us=period_us,
+        far_us=far_us,
+        lacked_us=lambda *_: lacked_us,
     )
 
 
@@ -184,6 +196,12 @@ def test_of_whom_a_message_says_nothing_is_not_missed_if_it_is_far() -> None:
     assert missed({0: (NOW_US, NOW_US)}, far_us=250_000) == [2], "control: it has never been heard"
 
 
+@pytest.mark.parametrize("far_us", [0, 250_000])
+def test_as_many_as_are_known_here_need_not_be_the_same(far_us: int) -> None:
+    """Agent 1 has heard agent 9, of which nothing is known here, and not agent 2."""
+    assert missed({0: (NOW_US, NOW_US), 9: (NOW_US, NOW_US)}, far_us=far_us, unheard=1) == [2]
+
+
 HELPERS = (0, 3, 4, 5, 6)
 
 
@@ -214,6 +232,10 @@ def test_who_helps_differs_from_agent_to_agent() -> None:
     for own in set(agents) - set(lost):
         others = {i: said for i, said in newest.items() if i != own}
         args = (own, others, others, dict.fromkeys(others, NOW_US), NOW_US)
-        counts.append(len(missed_by_peers(*args, period_us=PERIOD_US, far_us=0, lacked_us=lambda *_: 1_000_000)))
+        counts.append(
+            len(
+                missed_by_peers(*args, peers=len(others), period_us=PERIOD_US, far_us=0, lacked_us=lambda *_: 1_000_000)
+            )
+        )
     assert sum(counts) == 2 * (len(lost) - 1)
     assert max(counts) <= 5
