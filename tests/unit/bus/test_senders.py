@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from swarmctl.bus.local.hub import LocalBus, LocalHub
 from swarmctl.bus.refusals import HARMLESS, Refusals
-from swarmctl.bus.senders import SILENCE_US, Presence, ReceivedMessage, SenderVerifier, _Stream
+from swarmctl.bus.senders import SILENCE_US, Arrivals, Presence, ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.core.clock import SimClock
 
 RATE_HZ, TICK_US = 50.0, 20_000
@@ -133,6 +135,48 @@ def test_a_restart_is_accepted_with_its_third_message() -> None:
     bench.ticks(100, (REBORN,))
     assert bench.accepted_s(REBORN, began) == pytest.approx(0.06)
     assert bench.accused == {}
+
+
+def test_a_restart_between_two_ticks_is_accepted_with_its_third_message() -> None:
+    """Nobody has seen its token absent: it has joined once more."""
+    bench = Bench()
+    bench.ticks(50)
+    bench.token.close()
+    bench.token = bench.hub.connect("agent-1")
+    bench.ticks(1, [])
+    began = bench.tick
+    bench.ticks(50, [REBORN])
+    assert bench.accepted_s(REBORN, began) == pytest.approx(0.06)
+    assert bench.accused == {}
+
+
+def test_after_a_restart_what_continues_the_messages_of_the_process_before_is_refused() -> None:
+    bench = Bench()
+    bench.ticks(50)
+    bench.leave()
+    bench.clock.advance(700_000)
+    bench.come()
+    bench.ticks(5, [REBORN])
+    assert not bench.offer(TRUE, bench.seq[TRUE] + 1)
+    bench.ticks(1, [REBORN])
+    assert bench.accepted[-1] == (bench.tick, REBORN)
+
+
+def test_another_sender_that_comes_or_leaves_helps_no_forger_of_one_that_has_stayed() -> None:
+    bench = Bench()
+    bench.ticks(50)
+    other = bench.hub.connect("agent-2")
+    bench.ticks(10, [FORGED])
+    other.close()
+    bench.ticks(10, [FORGED])
+    assert {boot_id for _, boot_id in bench.accepted} == {TRUE}
+
+
+def test_a_sender_that_was_there_before_the_receiver_is_known_to_be_there() -> None:
+    bus = SimpleNamespace(alive=lambda: frozenset({"agent-1"}), arrivals=dict)  # none has joined since
+    presence = Presence(cast(Arrivals, bus))
+    presence.update(7)
+    assert (presence.since_us("agent-1"), presence.since_us("agent-2")) == (7, None)
 
 
 def test_messages_that_overtake_the_token_wait_for_it() -> None:
