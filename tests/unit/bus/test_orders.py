@@ -61,6 +61,7 @@ def test_nothing_holds_up_a_landing() -> None:
     agent = Agent3()
     assert agent.obeys("hold", NOW_US + MAX_LEAD_US)
     assert agent.obeys("land", NOW_US)
+    assert not agent.obeys("resume", NOW_US + MAX_LEAD_US - 1), "the hold is newer still"
 
 
 def test_orders_to_other_agents_are_ignored() -> None:

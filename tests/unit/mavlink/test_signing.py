@@ -205,3 +205,11 @@ def test_a_clock_that_is_wrong_when_the_program_starts_does_not_refuse_a_vehicle
     vehicle = Partner(stamp=0)
     assert vehicle.takes(ours.data)
     assert bench.taken(vehicle.frame()), "it goes on from our time stamp"
+
+
+def test_a_program_that_has_sent_nothing_for_minutes_takes_what_is_stamped_now() -> None:
+    """An agent that knows no state pauses its heartbeats, while its vehicle goes on."""
+    bench, vehicle = Bench(), Partner(stamp=START + 120 * STAMPS_PER_S)
+    assert not bench.taken(vehicle.frame())
+    bench.utc_us += 120_000_000
+    assert bench.taken(vehicle.frame())
