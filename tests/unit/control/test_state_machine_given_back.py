@@ -10,7 +10,7 @@ from swarmctl.control.phases.mission_state import TAKEN_OVER
 from swarmctl.control.phases.trajectories import OfferedMission
 from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
-from tests.benches.state_machine_flight import START, UTC0_US, Flight
+from tests.benches.state_machine_flight import SECOND, START, UTC0_US, Flight, ready
 
 
 @pytest.mark.parametrize("mode", [FlightMode.LAND, FlightMode.RTL, FlightMode.MANUAL])
@@ -78,6 +78,20 @@ def test_the_mission_is_approached_by_who_was_away_when_it_began(begun: bool) ->
     assert flight.at == "TRACK"
     reference, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.zeros(1))
     assert np.linalg.norm(reference[0] - flight.pos) < 2.5
+
+
+@pytest.mark.parametrize(("late_s", "away_m"), [(3.0, 0.0), (0.0, 1.0)], ids=["late", "away"])
+def test_a_mission_that_begins_without_or_beside_its_vehicle_is_approached_from_where_that_is(
+    late_s: float, away_m: float
+) -> None:
+    flight = ready()
+    flight.run(5.0)
+    flight.pos = flight.pos + np.array([0.0, away_m, 0.0])
+    flight.peer(Phase.TRACK, flight.utc_us - SECOND - round(late_s * 1e6))
+    while flight.phase is not Phase.TRACK:
+        flight.step()
+    reference, _ = flight.mission.reference(flight.utc_us, flight.now_us, np.zeros(1))
+    assert np.linalg.norm(reference[0] - flight.pos) < 0.3
 
 
 def test_the_time_with_a_pilot_does_not_count_as_waiting() -> None:
