@@ -127,8 +127,11 @@ def test_a_mission_ordered_while_some_wait_begins_for_all_at_the_time_of_the_ord
             flight.step()
         flight.mission.offered = offered
         begin_s = UTC0_US * 1e-6 + 60.0
+        if phase is Phase.READY:
+            flight.now_us = flight.mission.begin_utc_us - UTC0_US
         assert flight.ask("mission", begin_utc_s=begin_s, mission=1.0) == ""
         flight.step()
+        assert flight.phase is phase, "also where the mission before was about to begin"
         begins[phase] = flight.mission.begin_utc_us
     assert begins[Phase.READY] == begins[Phase.TRACK]
 
@@ -189,6 +192,17 @@ def test_a_landing_that_a_pilot_interrupts_is_taken_back_and_flown_to_where_ther
     assert flight.at == "GOTO_LAND"
     flight.flight_mode, flight.failsafe_mode = FlightMode.EXTERNAL, Mode.TRACKING
     assert Verb.LAND in flight.run(10.0)
+
+
+def test_a_vehicle_that_its_pilot_has_put_down_is_disarmed_after_a_resume_and_not_flown() -> None:
+    flight = Flight().until(Phase.LAND)
+    flight.flight_mode = FlightMode.LAND
+    flight.step()
+    flight.flight_mode = FlightMode.HOLD
+    flight.run(1.0)
+    flight.landed = Landed.ON_GROUND
+    assert flight.ask("resume") == ""
+    assert flight.run(0.5) == [Verb.DISARM]
 
 
 @pytest.mark.parametrize("mode", [FlightMode.HOLD, FlightMode.MANUAL])
