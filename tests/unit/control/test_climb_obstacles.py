@@ -226,3 +226,14 @@ def test_who_has_climbed_and_has_no_control_yet_lands_beside_it_too() -> None:
     assert set(flight.run(4.0)) == {Verb.EXTERNAL}
     flight.obstacles = ()
     assert Verb.LAND in flight.run(4.0)
+
+
+@pytest.mark.parametrize(("comes_in_s", "is_armed"), [(5.0, False), (11.0, False), (14.0, True)])
+def test_nobody_is_armed_while_an_obstacle_comes_within_the_time_to_spin_up_climb_and_take_control(
+    comes_in_s: float, is_armed: bool
+) -> None:
+    """It takes 6 s to spin up, 3 s to climb 3 m, and 3 s until the agent has control."""
+    flight = Flight()
+    north = NORTH + BALL.keep_out_m + 0.5 * comes_in_s
+    flight.obstacles = (PASSING.model_copy(update={"center_ned_m": (north, EAST, DOWN)}),)
+    assert (Verb.ARM in flight.run(1.0)) is is_armed
