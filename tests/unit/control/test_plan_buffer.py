@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -165,10 +167,16 @@ BLOWN_CLOSE = wall(1.0)  # the plan before, which ends at 0.5 m, and braking at 
 OPENS = np.append([0.3, 0.36], np.linspace(0.36, 0.1, STEPS - 1))  # comes closer before it opens
 
 
-def after_a_refused_plan(buffer: PlanBuffer, status: PlanStatus = PlanStatus.NOT_CERTIFIED) -> bool:
+def after_a_refused_plan(
+    buffer: PlanBuffer,
+    status: PlanStatus = PlanStatus.NOT_CERTIFIED,
+    *,
+    kept_m_s: float = 0.5,
+    by_own: bool = False,
+) -> bool:
     """Return whether the refused plan is flown."""
-    buffer.take(moving(speed_m_s=0.5), start_at(0), [], rest)
-    refused = plan_at(100_000, OPENS, status)
+    buffer.take(moving(speed_m_s=kept_m_s), start_at(0), [], rest)
+    refused = replace(plan_at(100_000, OPENS, status), by_own=by_own)
     buffer.take(refused, start_at(100_000), [BLOWN_CLOSE], lambda: plan_at(100_000, np.linspace(0.3, 0.45, STEPS + 1)))
     return buffer.plan is refused
 
@@ -186,3 +194,10 @@ def test_it_is_not_where_commitments_are_flown_nor_out_of_the_volume() -> None:
     corners = ((0.25, -9.0), (9.0, -9.0), (9.0, 9.0), (0.25, 9.0))
     north = FlightVolume(VolumeParams(corners_ne_m=corners, floor_z_m=0.0, ceiling_z_m=-9.0))
     assert not after_a_refused_plan(PlanBuffer(0, DT_US, STEPS, BRAKE_M_S2, volume=north))
+
+
+def test_it_is_not_where_the_plan_before_comes_less_close_nor_of_a_controller_of_somebody_else(
+    buffer: PlanBuffer,
+) -> None:
+    assert not after_a_refused_plan(buffer, kept_m_s=0.25)
+    assert not after_a_refused_plan(buffer, by_own=True)
