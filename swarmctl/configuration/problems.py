@@ -95,15 +95,19 @@ def _about_vector(error: Mapping[str, Any], location: Sequence[str], within: str
 
 
 def _hint(location: Sequence[str], root: type[Params], renamed: Mapping[str, str]) -> str:
-    """Suggest a correction for an unknown key: its new name, its word in another section, or a similar one in this."""
+    """Suggest a correction for an unknown key: its new name, a key of its name elsewhere, a similar one here, or a
+    section of its name.
+    """
     if now := renamed.get(".".join(location)):
         return f"did you mean {now!r}?"
-    elsewhere = [key for key in all_keys(root, "") if key.rpartition(".")[2] == location[-1]]
-    if elsewhere:
-        return f"did you mean {' or '.join(map(repr, elsewhere[:_PLACES_SHOWN]))}?"
+    keys = list(all_keys(root, ""))
+    elsewhere = [key for key in keys if key.rpartition(".")[2] == location[-1]]
+    sections = [key for key in elsewhere if any(other.startswith(f"{key}.") for other in keys)]
     known = _keys_at(location[:-1], root)
     close = difflib.get_close_matches(location[-1], known, 1)
-    return f"did you mean {close[0]!r}?" if close else f"known here: {', '.join(sorted(known))}"
+    if meant := [key for key in elsewhere if key not in sections] or close or sections:
+        return f"did you mean {' or '.join(map(repr, meant[:_PLACES_SHOWN]))}?"
+    return f"known here: {', '.join(sorted(known))}"
 
 
 def all_keys(model: Any, prefix: str) -> Iterator[str]:

@@ -45,6 +45,8 @@ def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
     ("override", "words"),
     [
         ("swarm.agnets=3", ("swarm.agnets = 3", "unknown key", "'agents'")),
+        ("swarm.agent=3", ("swarm.agent = 3", "unknown key; did you mean 'agents'?")),
+        ("agent.volume.margin_m=1", ("unknown key; did you mean 'volume'?",)),
         ("sitll.enabled=true", ("unknown key", "'sitl'")),
         ("swarm.colour='red'", ("swarm.colour = 'red'", "known here", "agents")),
         ("swarm.agents=0", ("swarm.agents = 0", ">= 1", "<= 100")),

@@ -32,7 +32,7 @@ from sitl.studies.bench.captured import (
     measure_xy,
     times_of,
 )
-from sitl.studies.bench.output import json_rows, write_texts
+from sitl.studies.bench.output import json_rows, make_folder, write_texts
 from sitl.studies.bench.ticks import PARTS, SWAPS, measure_swaps, measure_ticks
 from swarmctl.control.mpc.solvers.qp import SOLVERS, installed_solvers
 from swarmctl.core.types import Array
@@ -166,7 +166,12 @@ def write(rows: Sequence[BenchRow], directory: Path) -> Path:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure what the command line asks for, show and write it; return the exit code."""
+    """Measure what the command line asks for, show and write it; return the exit code.
+
+    Raises:
+        ConfigError: the folder can't be written to; nothing is measured then.
+    """
+    make_folder(options.out)
     console = Console()
     note = busy_note(os.getloadavg()[0], os.cpu_count() or 1)
     solvers, left_out = chosen_solvers(options.solver or ())

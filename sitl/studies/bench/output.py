@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 from swarmctl.errors import ConfigError
@@ -15,6 +16,20 @@ from swarmctl.files import replace_text
 def json_rows(rows: Sequence[Any]) -> str:
     """Return rows, each a dataclass, as a JSON list."""
     return json.dumps([asdict(row) for row in rows], indent=1) + "\n"
+
+
+def make_folder(directory: Path) -> None:
+    """Make the folder if necessary, and check that it takes a file, before minutes of measuring for it.
+
+    Raises:
+        ConfigError: it can't be made or written to.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        raise ConfigError("--out", [f"{directory}: can't be written: {error.strerror}"]) from error
 
 
 def write_texts(texts: Mapping[str, str], directory: Path) -> list[Path]:

@@ -50,6 +50,7 @@ def replay(
 ) -> int:
     """Open the recording of a run, or have its agents decide again."""
     from swarmctl.telemetry.recording.file_names import RECORDING
+    from swarmctl.telemetry.recording.run_files import refuse_no_folder
     from swarmctl.telemetry.view.recordings import open_viewer
 
     if decide and web:
@@ -58,6 +59,7 @@ def replay(
         return _decide(folder, sets or [], as_json)
     if sets or as_json:
         raise ConfigError("replay", ["--set and --json are for --decide"])
+    refuse_no_folder(folder)
     if web:
         return show_in_browser(str(folder / RECORDING))
     open_viewer(str(folder / RECORDING))

@@ -239,7 +239,8 @@ def read_parquet(path: Path, columns: Sequence[StoredColumn] = COLUMNS) -> NDArr
             raise _damaged(path, f"has {file.metadata.num_rows} rows, more than a day of one agent")
         return _stored_rows(file, columns)
     except (OSError, ValueError, pa.ArrowException) as error:  # a damaged file can raise any of these
-        raise _damaged(path, f"is no recording of ours: {error}. Remove it to see the others") from error
+        why = str(error).rstrip(".")  # some of Arrow's are sentences
+        raise _damaged(path, f"is no recording of ours: {why}. Remove it to see the others") from error
 
 
 def _stored_rows(file: Any, columns: Sequence[StoredColumn]) -> NDArray[np.void]:

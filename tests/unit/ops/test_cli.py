@@ -265,7 +265,10 @@ def test_version_is_printed(run: Run, capsys: pytest.CaptureFixture[str]) -> Non
 
 @pytest.mark.parametrize(
     "arguments",
-    [("lanch",), ("launch", "--agents", "x"), ("launch", "--nonsense"), ("agent",), ("launch", "a", "b"), ("replay",)],
+    [
+        *[("lanch",), ("launch", "--agents", "x"), ("launch", "--nonsense"), ("agent",), ("launch", "a", "b")],
+        *[("replay",), ("replay", "no-such-folder"), ("replay", "no-such-folder", "--web")],
+    ],
 )
 def test_bad_usage_is_2(run: Run, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]) -> None:
     assert run(*arguments) == 2

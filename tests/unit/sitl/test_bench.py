@@ -324,6 +324,15 @@ def test_growth_is_measured_written_and_drawn(tmp_path: Path, capsys: pytest.Cap
     assert (tmp_path / "scale.html").read_text().count("<figure>") == 9
 
 
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bench, "bench", lambda *_, **__: pytest.fail("measured"))
+    (tmp_path / "file").touch()
+    assert command.main(["--out", str(tmp_path / "file" / "folder")]) == 2
+    assert "can't be written" in capsys.readouterr().err
+
+
 def test_growth_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="can't be written"):
