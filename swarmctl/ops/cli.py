@@ -313,7 +313,7 @@ def campaign(context: typer.Context) -> NoReturn:
 def _become(module: str, arguments: list[str]) -> NoReturn:
     """Replace this process by a module of the simulator, which the bridge never imports."""
     sys.stdout.flush()
-    os.execv(sys.executable, [*module_command(module, *arguments)])
+    os.execv(sys.executable, [*module_command("sitl.verb", module, *arguments)])
 
 
 def _overrides(agents: int | None, duration: float | None, seed: int | None, sets: list[str] | None) -> list[str]:

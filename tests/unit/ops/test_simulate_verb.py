@@ -81,3 +81,21 @@ def test_ctrl_c_while_files_are_packed_is_too_late(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.stdout.startswith("completed"), done.stderr
     assert done.returncode == 0, "as it says"
+
+
+@pytest.mark.parametrize("verb", ["simulate", "sweep"])
+def test_ctrl_c_while_modules_are_imported_is_an_interruption(verb: str, tmp_path: Path) -> None:
+    """It ended in a traceback and by the signal, which is no exit code."""
+    folder = ("--set", "mission.circle.radius_m=2,3", "--out") if verb == "sweep" else ("--run-dir",)
+    command = [sys.executable, "-m", "swarmctl", verb, *folder, str(tmp_path / "run")]
+    where = {**os.environ, "PYTHONPROFILEIMPORTTIME": "1"}  # prints what is imported, as it is
+    process = subprocess.Popen(command, env=where, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    told = []
+    for line in process.stderr:
+        told.append(line)
+        if line.split()[-1:] == ["numpy"]:
+            process.send_signal(signal.SIGINT)
+    assert process.wait(60) == 130
+    assert "Traceback" not in "".join(told)
+    assert not (tmp_path / "run").exists()
