@@ -17,6 +17,7 @@ import pytest
 import swarmctl
 from sitl.studies.campaign.trials import SCHEMA
 from sitl.studies.sweep.figures import schema_of
+from swarmctl.bus.messages.json_messages import StatusMessage
 from swarmctl.configuration.keys import sections
 from swarmctl.configuration.sections import SitlParams
 from swarmctl.control.controllers.own import GROUP as CONTROLLERS_OFFERED
@@ -149,6 +150,13 @@ def test_what_troubleshooting_quotes_is_said_by_the_code() -> None:
 def test_links_lead_to_files(page: Path) -> None:
     links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
     assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
+
+
+def test_every_key_of_a_status_is_described() -> None:
+    page = (ROOT / "docs" / "data_formats.md").read_text()
+    section = page.partition("\n## `status --json`\n")[2].partition("\n## ")[0]
+    keys = {key for row in re.findall(r"^\| (`[^|]+`) \|", section, re.MULTILINE) for key in QUOTED.findall(row)}
+    assert keys - {"key"} == set(StatusMessage.__struct_fields__)
 
 
 def test_the_page_of_the_architecture_names_every_module() -> None:
