@@ -107,6 +107,8 @@ def _claim(base: Path) -> Path:
         raise ConfigError(f"--run-dir {base}", [f"holds a symbolic link ({links[0]}). Choose a new folder or empty it"])
     if taken:
         raise ConfigError(f"--run-dir {base}", [f"holds a run already ({taken[0]}). Choose a new folder or empty it"])
+    if is_held(base / OUTCOME):  # of a simulation that begins, and has no other files yet
+        raise ConfigError(f"--run-dir {base}", ["another simulation has just begun there. Choose a new folder"])
     return base
 
 

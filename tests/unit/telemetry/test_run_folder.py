@@ -29,7 +29,14 @@ from swarmctl.telemetry.recording import run_folder
 from swarmctl.telemetry.recording.file_names import OUTCOME
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, read_received, write_parquet
-from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run, write_config
+from swarmctl.telemetry.recording.run_folder import (
+    Outcome,
+    create_run_folder,
+    finish_run,
+    held_run,
+    report_run,
+    write_config,
+)
 from swarmctl.telemetry.report.thinning import thin
 from tests.benches.pages import parsed
 from tests.benches.recorded_runs import FAR_BALL, RULES, UTC_US, flight, write_run
@@ -271,6 +278,15 @@ def test_report_of_a_run_whose_launcher_died_says_so(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["outcome"] == "failed"
     assert summary["violations"] == ["the launcher did not finish this run"]
+
+
+def test_two_simulations_that_begin_at_once_share_no_folder(tmp_path: Path) -> None:
+    """Both flew, wrote over each other's files and ended with success."""
+    folder = create_run_folder(tmp_path / "run", "x", 0)
+    write_config(folder, "", "lockstep")
+    assert create_run_folder(folder, "x", 0) == folder, "as by a script, which has a launch fly what it has written"
+    with held_run(folder), pytest.raises(ConfigError, match="another simulation has just begun there"):
+        create_run_folder(folder, "x", 0)
 
 
 def test_a_simulation_that_was_cut_off_is_judged_as_one(tmp_path: Path) -> None:
