@@ -375,6 +375,7 @@ class Agent:
                 now_us, accuracy_m, state, others_ned_m, self._world_model.statuses.codes
             ),
             too_slow=self._start_conditions.too_slow(now_us, self._deadlines.missed_01),
+            missed_01=self._deadlines.missed_01,
             overload=self._deadlines.level,
             escalation=self._modes.escalation,
             setpoints_stopped=self._deadlines.stop_cause(now_us),

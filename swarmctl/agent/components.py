@@ -241,6 +241,7 @@ def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
         landing_m=budget.landing_m(setup.params.state_machine.apart_m),
         home_m=budget.home_m,
         start_ned_m=setup.starts_ned_m[setup.agent],
+        brake_m_s2=min(setup.separation.brake_m_s2, setup.controller.mpc.accel_max_m_s2(setup.vehicle_model)),
         duration_s=setup.mission.duration_s,
         reference=reference,
         contains=lambda at_ne_m: setup.fence is None or setup.fence.contains(at_ne_m),

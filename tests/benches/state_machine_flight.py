@@ -38,6 +38,7 @@ class Flight:
             landing_m=RADIUS_M + told.apart_m,
             home_m=2.0 / 3.0 * RADIUS_M,
             start_ned_m=START,
+            brake_m_s2=2.0,
             duration_s=DURATION_S,
             reference=mission,
         )
@@ -54,7 +55,7 @@ class Flight:
         self.arm_in: FlightMode | None = None
         self.boots = 0
         self.refusal = self.unsettled = self.too_slow = self.cut_off = ""
-        self.overload = Level.NONE
+        self.overload, self.missed_01 = Level.NONE, 0.0
         self.beat_us: int | None = None  # arrival of the HEARTBEAT that reported `armed`; None: one with every step
         self.busy = self.unresponsive_peer = False
         self.setpoints_stopped = ""
@@ -113,6 +114,7 @@ class Flight:
             refusal=self.refusal,
             unsettled=self.unsettled,
             too_slow=self.too_slow,
+            missed_01=self.missed_01,
             overload=self.overload,
             cut_off=self.cut_off,
             escalation=self.escalation,

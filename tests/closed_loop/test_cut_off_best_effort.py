@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +12,12 @@ from sitl.lockstep import Lockstep
 from swarmctl.agent import assembly
 from swarmctl.bus.bus import agent_name
 from swarmctl.config import load
+from swarmctl.control.phases.mission_state import MissionState
+from swarmctl.control.phases.trajectories import Trajectories
 from swarmctl.core.closest_pair import closest_pair_m
-from tests.closed_loop.conftest import COARSE, mission_t_s
+from swarmctl.core.types import Array, Phase, VehicleState
+from swarmctl.simulator_config import EVERY_VEHICLE, FaultParams
+from tests.closed_loop.conftest import COARSE, closer_than, fly_now, mission_t_s
 
 CUT_AT_S, CUT_S = 0.5, 5.0
 SWAP = (
@@ -100,3 +105,118 @@ def test_without_relays_nobody_is_taken_for_dead(relay: bool, quorum: int) -> No
     config = load(None, (*SWAP, hosts((0, 1), (2, 3)), f"bus.relay={str(relay).lower()}"))
     assert assembly._quorum(config) == quorum
     assert assembly._quorum(load(None, SWAP)) == 1, "on one computer who has left is dead"
+
+
+# -- two that swap places, when the bus carries nothing any more -------------------------------------------------------
+
+PAIR = (*COARSE, "sitl.start=air", "swarm.agents=2", "mission.kind=swap", "mission.duration_s=30")
+# 2.3 m/s each, 13 m apart: either is to stop where the other would have to be by then, if it stopped as transits do.
+FAR = (*PAIR, "start.positions_ned_m=[[10,0,-2],[-10,0,-2]]", "mission.swap.travel_s=12")
+FAR_CUT_S, FAR_AT_REST_S = 3.6, 8.6
+# Likewise, but it is the first one alone that hears nobody: the others are a majority, and fly on.
+THREE = (
+    *COARSE,
+    "sitl.start=air",
+    "swarm.agents=3",
+    "mission.kind=swap",
+    "mission.duration_s=30",
+    "start.positions_ned_m=[[10,0,-2],[-10,0,-2],[3,16,-2]]",
+    "mission.swap.travel_s=12",
+    "bus.relay=true",
+    hosts((0,), (1,), (2,)),
+)
+THREE_CUT_S, THREE_PASSED_S = 3.8, 8.8
+# They have passed each other, so that their ways home meet again.
+NEAR = (
+    *PAIR,
+    "start.positions_ned_m=[[2,0,-2],[-2,0,-2]]",
+    "mission.swap.travel_s=5",
+    "agent.failsafe.window_s=1",
+    "sitl.battery.capacity_mah=3000",
+)
+NEAR_CUT_S, NEAR_LOW_S = 4.5, 6.0
+HOME_S = 5.0  # from there, for who flies at once
+
+
+def cut(running: Lockstep) -> None:
+    running.hub.fail()
+
+
+def cut_off(running: Lockstep) -> None:
+    running.hub.split([frozenset([agent_name(0)]), frozenset(map(agent_name, (1, 2)))])
+
+
+def wear(running: Lockstep) -> None:
+    """Leave so little charge to all vehicles that they fly back."""
+    running.world.faults.begin(FaultParams(kind="battery", vehicle=EVERY_VEHICLE, value=0.15), running.clock.now_us())
+
+
+def past(t_s: float) -> Callable[[Lockstep], bool]:
+    return lambda running: mission_t_s(running) >= t_s
+
+
+def returning_for(seconds: float) -> Callable[[Lockstep], bool]:
+    """Return what ends a flight so long after all have left their mission."""
+    began_us: list[int] = []
+
+    def ends(running: Lockstep) -> bool:
+        if running.mission_is_over() and not began_us:
+            began_us.append(running.clock.now_us())
+        return bool(began_us) and running.clock.now_us() >= began_us[0] + round(seconds * 1e6)
+
+    return ends
+
+
+def softly(now: Trajectories, now_us: int, state: VehicleState, **_: object) -> None:
+    """Brake to rest as softly in a pause as transits do."""
+    stops(now, now_us, state)
+
+
+def home_at_once(now: MissionState, now_us: int, state: VehicleState) -> None:
+    """Fly home, whoever is silent."""
+    now.landing.go_home(now_us, state)
+    now._begin_landing(now_us)
+
+
+stops = Trajectories.stop
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_who_hears_nobody_any_more_stops_within_the_way_that_peers_expect(seed: int) -> None:
+    flight = fly_now(*FAR, at={FAR_CUT_S: cut}, until=past(FAR_AT_REST_S), seed=seed)
+    assert flight.separation_m() >= 3.0
+    assert speeds_m_s(flight.lockstep).max() < 0.1
+
+
+def test_negative_control_softer_stops_end_in_a_collision(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Trajectories, "stop", softly)
+    fly_now(*FAR, at={FAR_CUT_S: cut}, until=closer_than(0.3))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_who_is_cut_off_stops_within_the_way_that_a_majority_expects(seed: int) -> None:
+    flight = fly_now(*THREE, at={THREE_CUT_S: cut_off}, until=past(THREE_PASSED_S), seed=seed)
+    assert flight.separation_m() >= 0.85
+
+
+def test_negative_control_who_stops_softer_is_met_by_the_majority(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Trajectories, "stop", softly)
+    fly_now(*THREE, at={THREE_CUT_S: cut_off}, until=closer_than(0.3), seed=2)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_worn_batteries_bring_nobody_home_through_silent_peers(seed: int) -> None:
+    """All are worn at about the same time, as all have flown for as long."""
+    flight = fly_now(*NEAR, at={NEAR_CUT_S: cut, NEAR_LOW_S: wear}, until=returning_for(HOME_S), seed=seed)
+    assert flight.separation_m() >= 0.85
+    assert [flight.lockstep.logs[i].rows[-1]["phase"][0] for i in range(2)] == [Phase.GOTO_LAND] * 2
+    assert speeds_m_s(flight.lockstep).max() < 0.1
+
+
+def test_negative_control_worn_batteries_bring_all_home_through_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MissionState, "go_home", home_at_once)
+    fly_now(*NEAR, at={NEAR_CUT_S: cut, NEAR_LOW_S: wear}, until=closer_than(0.3))
+
+
+def speeds_m_s(flown: Lockstep) -> Array:
+    return np.asarray(np.linalg.norm(flown.world.truth_rows()["vel_ned_m_s"], axis=1))

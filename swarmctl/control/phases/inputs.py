@@ -44,6 +44,7 @@ class PhaseInputs:
     refusal: str = ""  # reason why arming is refused for good, up to ARM
     unsettled: str = ""  # reason why arming must wait
     too_slow: str = ""  # what its processor has yet to show, likewise
+    missed_01: float = 0.0  # fraction of deadlines missed of late
     overload: Level = Level.NONE  # response to missed deadlines
     escalation: Escalation = NOTHING_WORN  # response to what wears out: battery, link
     setpoints_stopped: str = ""  # by missed deadlines a moment ago, in words

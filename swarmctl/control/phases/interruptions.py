@@ -38,7 +38,7 @@ class Interruptions:
         self.held = False
         self.held_since_us = 0
         self.yaw_rad: float | None = None
-        self.paused = False
+        self.paused = self._keeps_up = False
         self._point: HoldPoint | None = None
 
     @property
@@ -71,7 +71,7 @@ class Interruptions:
     def stay(self, now_us: int, state: VehicleState) -> None:
         """Come to rest: here, or at the point that a hold asks for, unless the agent is paused."""
         if self._point is None or self.paused:
-            self._trajectories.stop(now_us, state)
+            self._trajectories.stop(now_us, state, at_once=self.stops_at_once)
         else:
             self._trajectories.go_to(self._point.ned_m, now_us, state, self._point.speed_m_s)
 
@@ -79,11 +79,29 @@ class Interruptions:
         """End a hold, if there is one."""
         self.held, self._point, self.yaw_rad = False, None, None
 
-    def update_pause(self, now_us: int, state: VehicleState, *, must_wait: bool, flies: bool) -> bool:
-        """Begin or end a pause; return whether the agent goes on with what was interrupted."""
+    @property
+    def stops_at_once(self) -> bool:
+        """Return whether a stop has to be hard, as in a pause.
+
+        Who is paused is not heard, or hardly. Peers expect such a vehicle to brake hard at the end of its path, and one
+        that braked as softly as transits do was met where it was taken to have stopped long before. Who misses
+        deadlines can't: it would hold its tilt for too long.
+        """
+        return self.paused and self._keeps_up
+
+    def update_pause(self, now_us: int, state: VehicleState, *, must_wait: bool, flies: bool, keeps_up: bool) -> bool:
+        """Begin or end a pause; return whether the agent goes on with what was interrupted.
+
+        Args:
+            now_us, state: now.
+            must_wait: peers are silent, or deadlines are missed.
+            flies: the agent has control.
+            keeps_up: hardly any deadline is missed.
+        """
         if must_wait and flies and not self.paused:
-            self._interrupt(now_us, state, brakes=True)
-            self.paused = True
+            self._interrupt(now_us, state, brakes=False)
+            self.paused, self._keeps_up = True, keeps_up
+            self.stay(now_us, state)
         elif self.paused and not must_wait:
             self.paused = False
             if not self.held:
@@ -96,4 +114,4 @@ class Interruptions:
         if not self.active:
             self._trajectories.keep_destination()
         if brakes:
-            self._trajectories.stop(now_us, state)
+            self._trajectories.stop(now_us, state, at_once=self.stops_at_once)

@@ -59,10 +59,10 @@ class Landing:
         self._trajectories.go_to(self._start_ned_m, now_us, state)
         self._trajectories.keep_destination()
 
-    def stop_in_place(self, now_us: int, state: VehicleState) -> None:
-        """Begin to brake, to land where the vehicle comes to rest."""
+    def stop_in_place(self, now_us: int, state: VehicleState, *, at_once: bool) -> None:
+        """Begin to brake, smoothly or at once, to land where the vehicle comes to rest."""
         self.in_place = True
-        self._trajectories.stop(now_us, state)
+        self._trajectories.stop(now_us, state, at_once=at_once)
         self._trajectories.keep_destination()
 
     def is_reached(self, inputs: PhaseInputs, state: VehicleState, *, controls: bool, paused: bool) -> bool:

@@ -41,6 +41,7 @@ class MissionSetup:
     landing_m: float  # level distance to others at which it may land in place
     home_m: float  # the same at the start position
     start_ned_m: Array  # (3,) start position, also the landing place
+    brake_m_s2: float  # mean deceleration of a stop at once, which peers that hear nothing expect
     duration_s: float  # of the tracked mission
     reference: MissionReference  # of the tracked mission
     contains: Contains = lambda _: True  # whether a place lies within the geofence
@@ -97,7 +98,11 @@ class MissionState:
         self.setpoints_stopped = self.airborne = self.landing_seen = False
         self.arming, self.climb = ArmingEvidence(), Climb(setup.start_ned_m)
         self.trajectories = Trajectories(
-            setup.reference, setup.start_ned_m, speed_m_s=params.speed_m_s, accel_m_s2=params.accel_m_s2
+            setup.reference,
+            setup.start_ned_m,
+            speed_m_s=params.speed_m_s,
+            accel_m_s2=params.accel_m_s2,
+            brake_m_s2=setup.brake_m_s2,
         )
         self.interruptions = Interruptions(self.trajectories)
         self.landing = Landing(
@@ -270,13 +275,15 @@ class MissionState:
             self.land_by_us = now_us + round(self.params.land_timeout_s * 1e6)
 
     def go_home(self, now_us: int, state: VehicleState) -> None:
-        """Fly to the landing place."""
+        """Fly to the landing place, once no pause is left: who is silent may be on the way, and does not know of it."""
         self.landing.go_home(now_us, state)
         self._begin_landing(now_us)
+        if self.interruptions.paused:
+            self.interruptions.stay(now_us, state)
 
     def stop_in_place(self, now_us: int, state: VehicleState) -> None:
         """Brake and move away from others under the own plan, then let the autopilot land there."""
-        self.landing.stop_in_place(now_us, state)
+        self.landing.stop_in_place(now_us, state, at_once=self.interruptions.stops_at_once)
         self._begin_landing(now_us)
 
     def go_on(self, now_us: int, utc_us: int, state: VehicleState) -> None:

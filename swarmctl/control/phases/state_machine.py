@@ -24,6 +24,7 @@ from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
 from swarmctl.core.types import Command, FlightMode, Mode, Phase, VehicleState
 
 _LATE_US, _AWAY_M = 200_000, 0.5  # from its begin and from the start, from which on its reference is approached
+_KEEPS_UP_01 = 0.15  # of deadlines missed
 _LEAST_HEIGHT_M = 0.5  # above the ground, of a point to go to
 REBOOTED = "the autopilot rebooted"
 OVERLOADED = "overload: deadlines were missed for too long"
@@ -181,7 +182,8 @@ class MissionStateMachine:
         mission = self.mission
         flies = mission.had_control and Phase.GOTO_START <= mission.phase <= Phase.GOTO_LAND
         must_wait = inputs.unresponsive_peer or inputs.overload >= Level.HOLD
-        if mission.interruptions.update_pause(inputs.now_us, state, must_wait=must_wait, flies=flies):
+        waits = {"must_wait": must_wait, "flies": flies, "keeps_up": inputs.missed_01 < _KEEPS_UP_01}
+        if mission.interruptions.update_pause(inputs.now_us, state, **waits):
             mission.go_on(inputs.now_us, inputs.utc_us, state)
 
     def _lose_patience(self, inputs: PhaseInputs, state: VehicleState) -> None:

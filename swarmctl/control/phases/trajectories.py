@@ -43,15 +43,24 @@ class Trajectories:
         start_ned_m: (3,) start position; the reference until there is a trajectory.
         speed_m_s: peak speed of a transit.
         accel_m_s2: peak acceleration of transits and stops.
+        brake_m_s2: mean deceleration of a stop at once.
 
     Attributes:
         current: transit or stop that began last, None before the first.
         destination_ned_m: (3,) end of the transit that a pause or a hold interrupts.
     """
 
-    def __init__(self, mission: MissionReference, start_ned_m: Array, *, speed_m_s: float, accel_m_s2: float) -> None:
+    def __init__(
+        self,
+        mission: MissionReference,
+        start_ned_m: Array,
+        *,
+        speed_m_s: float,
+        accel_m_s2: float,
+        brake_m_s2: float,
+    ) -> None:
         self._mission, self._start_ned_m = mission, start_ned_m
-        self._speed_m_s, self._accel_m_s2 = speed_m_s, accel_m_s2
+        self._speed_m_s, self._accel_m_s2, self._brake_m_s2 = speed_m_s, accel_m_s2, brake_m_s2
         self.current: BegunTrajectory | None = None
         self.destination_ned_m = start_ned_m
         self._rejoin_offset: BegunTrajectory | None = None  # decaying offset to the mission's reference
@@ -86,9 +95,10 @@ class Trajectories:
         )
         self._begin(here, now_us)
 
-    def stop(self, now_us: int, state: VehicleState) -> None:
-        """Begin to brake to rest."""
-        self._begin(brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._accel_m_s2), now_us)
+    def stop(self, now_us: int, state: VehicleState, *, at_once: bool = False) -> None:
+        """Begin to brake to rest, smoothly or at once."""
+        accel_m_s2 = max(self._accel_m_s2, 2.0 * self._brake_m_s2) if at_once else self._accel_m_s2
+        self._begin(brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, accel_m_s2), now_us)
 
     def go_to(self, target_ned_m: Array, now_us: int, state: VehicleState, speed_m_s: float | None = None) -> None:
         """Begin a transit to a target (3,), at the peak speed of transits or another one."""

@@ -62,7 +62,7 @@ def quintic_to(pos: Array, vel: Array, target: Array, speed_m_s: float, *, accel
 
 
 def brake_to_rest(pos: Array, vel: Array, accel_m_s2: float) -> QuinticTrajectory:
-    """Return a `QuinticTrajectory` that stops straight ahead, about as soon as `accel_m_s2` allows."""
+    """Return a `QuinticTrajectory` that stops straight ahead: at half of `accel_m_s2` on average, 3/4 at its peak."""
     speed = math.sqrt(float(vel @ vel))
     travel_s = max(0.5, 2.0 * speed / accel_m_s2)
     return QuinticTrajectory(from_ned_m=pos, vel_ned_m_s=vel, to_ned_m=pos + 0.5 * travel_s * vel, travel_s=travel_s)

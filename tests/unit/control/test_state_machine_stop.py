@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from swarmctl.control.failsafe.decision import Escalation, Response
 from swarmctl.control.failsafe.overload import Level
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
-from swarmctl.core.types import FlightMode, Phase, Verb
-from tests.benches.state_machine_flight import IN_AIR, ON_GROUND, START, Flight
+from swarmctl.core.types import FlightMode, Mode, Phase, Verb
+from tests.benches.state_machine_flight import IN_AIR, ON_GROUND, START, Flight, controlled
 
 
 def asked_to_arm(busy: bool) -> Flight:
@@ -263,3 +264,55 @@ def test_an_agent_that_is_cut_off_from_its_peers_lands_where_it_is(phase: Phase)
     flight.run(0.2)
     assert flight.phase >= Phase.GOTO_LAND
     assert flight.mission.outcome == "cut off from agent-1"
+
+
+# -- while peers are silent --------------------------------------------------------------------------------------------
+
+
+def paused(speed_m_s: float = 0.0, missed_01: float = 0.0) -> Flight:
+    """Return a flight in the mission, 5 m from its start, that hears nobody any more."""
+    flight = controlled(Phase.TRACK)
+    flight.missed_01 = missed_01
+    flight.pos, flight.vel = START + np.array([5.0, 0.0, 0.0]), np.array([speed_m_s, 0.0, 0.0])
+    flight.failsafe_mode, flight.unresponsive_peer = Mode.TRACKING, True
+    flight.run(0.1)
+    return flight
+
+
+def comes_to(flight: Flight) -> np.ndarray:
+    return np.asarray(flight.mission.reference(flight.utc_us, flight.now_us, np.array([60.0]))[0][0])
+
+
+@pytest.mark.parametrize("why", ["rtl", "battery"])
+def test_who_has_to_fly_back_rests_until_peers_are_heard(why: str) -> None:
+    flight = paused()
+    if why == "rtl":
+        assert flight.ask("rtl") == ""
+    else:
+        flight.escalation = Escalation(Response.RTL, "battery at 15 %")
+    flight.run(1.0)
+    assert (flight.at, flight.mission.landing.in_place) == ("GOTO_LAND", False)
+    np.testing.assert_allclose(comes_to(flight), flight.pos)
+    flight.unresponsive_peer = False
+    flight.run(0.1)
+    np.testing.assert_allclose(comes_to(flight), START)
+
+
+def test_who_has_to_fly_back_and_hears_nobody_lands_where_it_rests() -> None:
+    flight = paused()
+    assert flight.ask("rtl") == ""
+    assert Verb.LAND not in flight.run(20.0)
+    assert Verb.LAND in flight.run(10.0)
+
+
+@pytest.mark.parametrize("verb", ["hold", "land", "rtl"])
+def test_an_order_does_not_make_the_stop_of_a_pause_softer(verb: str) -> None:
+    flight = paused(speed_m_s=2.0)
+    assert flight.ask(verb) == ""
+    flight.run(0.1)
+    np.testing.assert_allclose(comes_to(flight) - flight.pos, [1.0, 0.0, 0.0])  # at 2 m/s2
+
+
+def test_who_misses_deadlines_does_not_stop_harder_than_it_can() -> None:
+    flight = paused(speed_m_s=1.2, missed_01=0.5)
+    np.testing.assert_allclose(comes_to(flight) - START, [6.2, 0.0, 0.0])  # at half of accel_m_s2
