@@ -138,6 +138,19 @@ NEAR_CUT_S, NEAR_LOW_S = 4.5, 6.0
 HOME_S = 5.0  # from there, for who flies at once
 
 
+# Six that meet in the middle: who rests is driven from where it stopped by where others are believed to be.
+SIX = (
+    *COARSE,
+    "sitl.start=air",
+    "swarm.agents=6",
+    "mission.kind=swap",
+    "mission.duration_s=30",
+    "start.positions_ned_m=[[3,0,-2],[1.5,2.6,-2],[-1.5,2.6,-2],[-3,0,-2],[-1.5,-2.6,-2],[1.5,-2.6,-2]]",
+    "mission.swap.travel_s=6",
+)
+SIX_CUT_S, SIX_DEADLOCKED_S = 2.4, 11.5
+
+
 def cut(running: Lockstep) -> None:
     running.hub.fail()
 
@@ -220,3 +233,15 @@ def test_negative_control_worn_batteries_bring_all_home_through_each_other(monke
 
 def speeds_m_s(flown: Lockstep) -> Array:
     return np.asarray(np.linalg.norm(flown.world.truth_rows()["vel_ned_m_s"], axis=1))
+
+
+def test_who_rests_stays_where_it_has_been_driven_to() -> None:
+    flight = fly_now(*SIX, at={SIX_CUT_S: cut}, until=past(SIX_DEADLOCKED_S), seed=1)
+    assert flight.separation_m() >= 0.8
+    assert speeds_m_s(flight.lockstep).max() < 0.1
+
+
+@pytest.mark.usefixtures("configured_starts")
+def test_negative_control_who_goes_back_to_where_it_stopped_meets_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Trajectories, "is_left", lambda *_: False)
+    fly_now(*SIX, at={SIX_CUT_S: cut}, until=closer_than(0.3), seed=1)

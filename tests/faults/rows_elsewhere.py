@@ -154,6 +154,16 @@ ROWS = tuple(
             "negative_control_worn_batteries_bring_all_home_through_each_other",
         ),
         (
+            "silent-driven-away",
+            "the bus carries nothing any more, where six meet and are driven from where they stop",
+            "all rest where they are",
+            5.0,
+            "who has been driven away stops there",
+            "test_cut_off_best_effort.py",
+            "who_rests_stays_where_it_has_been_driven_to",
+            "negative_control_who_goes_back_to_where_it_stopped_meets_another",
+        ),
+        (
             "clocks-apart",
             "the clocks of hosts differ by a second, and drift",
             "all arrive, at the distance that is committed to",

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from swarmctl.control.phases.trajectories import Trajectories
 from swarmctl.core.types import Array, VehicleState
 
+_DRIVEN_M = 0.3  # from where it has stopped, of a vehicle that rests where it is then
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HoldPoint:
@@ -107,6 +109,8 @@ class Interruptions:
             if not self.held:
                 return True
             self.stay(now_us, state)
+        elif self.paused and self._trajectories.is_left(now_us, state, _DRIVEN_M):
+            self.stay(now_us, state)  # the way back may lead through others that were driven away, too
         return False
 
     def _interrupt(self, now_us: int, state: VehicleState, *, brakes: bool) -> None:

@@ -106,6 +106,13 @@ class Trajectories:
         transit = quintic_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, speed_m_s, accel_m_s2=self._accel_m_s2)
         self._begin(transit, now_us)
 
+    def is_left(self, now_us: int, state: VehicleState, away_m: float) -> bool:
+        """Return whether the present trajectory is over and the vehicle farther than that from its end."""
+        begun = self.current
+        if begun is None or now_us - begun.began_us <= begun.trajectory.travel_s * 1e6:
+            return False
+        return math.dist(state.pos_ned_m, begun.trajectory.to_ned_m) > away_m
+
     def keep_destination(self) -> None:
         """Take the end of the present trajectory as the destination, which later stops don't change."""
         if self.current is not None:

@@ -316,3 +316,12 @@ def test_an_order_does_not_make_the_stop_of_a_pause_softer(verb: str) -> None:
 def test_who_misses_deadlines_does_not_stop_harder_than_it_can() -> None:
     flight = paused(speed_m_s=1.2, missed_01=0.5)
     np.testing.assert_allclose(comes_to(flight) - START, [6.2, 0.0, 0.0])  # at half of accel_m_s2
+
+
+def test_who_rests_for_silent_peers_stays_where_it_has_been_driven_to() -> None:
+    flight = paused()
+    flight.run(1.0)
+    for away_m, follows in ((0.2, False), (1.0, True)):
+        flight.pos = START + np.array([5.0, away_m, 0.0])
+        flight.run(0.2)
+        assert np.allclose(comes_to(flight), flight.pos) == follows
