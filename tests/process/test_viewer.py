@@ -203,7 +203,7 @@ def test_recording_holds_what_was_published(endpoint: str, tmp_path: Path) -> No
         modes = [row[name] for row in found[f"/state/{agent}/mode"] for name in row if name.endswith("state")]
         assert ["REPLAY"] in modes
     least = np.array(scalars(found["/plot/separation/min"]))
-    assert len(least) > 90
+    assert len(least) > 50, "one for every tick, but for where nothing was published for half a second"
     assert np.allclose(least, 1.0, atol=0.02)  # agents publish one after another
     texts = [row[name][0] for row in found["/events/agent-1"] for name in row if name.endswith("TextLog:text")]
     assert "agent 1: mode REPLAY" in texts
@@ -245,7 +245,7 @@ def test_frozen_telemetry_costs_the_agents_nothing(endpoint: str, tmp_path: Path
         assert swarm.slowest_put_s < 0.5
         process.send_signal(signal.SIGCONT)
         swarm.fly(0.5)
-        time.sleep(0.3)
+        time.sleep(3.0)  # a viewer that yields to others takes in what has waited
         lost, received, _ = (int(word.split("=")[1]) for word in finish(process).split()[1:])
         assert lost + received == 450  # what the frozen process could not take is counted
         assert received >= 150 - 15, "all but what was under way when it froze"

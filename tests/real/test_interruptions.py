@@ -39,6 +39,7 @@ PHASES = ("CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK"
 CLIMBED_M, START_HEIGHT_M, HIGH_M = 0.5, 2.0, 15.0
 MOVED_M_S = 2.0  # by a ground station, in hold
 STRAYED_M = 20.0  # from the middle of the circle; followed for 40 s, the lost position led 180 m away
+SILENT_FROM_M = 13.0  # of two at 2.3 m/s each
 STOPPED_S = 60.0  # within which nothing is armed any more, or it is named
 
 
@@ -74,6 +75,34 @@ def test_a_killed_agent_ends_with_its_vehicle_on_the_ground_and_the_others_finis
     assert here.witness.read_parameter(1, TAKEOFF_HEIGHT) == takeoff_m, "set back by the agent that landed it"
     assert min(tracked_s(launched, 0), tracked_s(launched, 2)) == pytest.approx(30.0, abs=0.5)
     assert here.witness.min_separation_m() > BODIES_M
+
+
+def test_two_that_hear_nobody_any_more_stop_where_they_do_not_meet(field: Fielder) -> None:
+    """They come at each other, and would meet if they stopped as transits do, at half of `accel_m_s2`."""
+    here = field(PX4, 2)
+    swap = ("mission.kind=swap", "mission.swap.travel_s=12", "start.positions_ned_m=[[10,0,-3],[-10,0,-3]]")
+    launched = here.launch(PX4_CONFIG, "--agents", "2", *(f"--set={each}" for each in swap), "--duration", "40")
+    launched.until_phase("TRACK", 2)
+    router = launched.pid_of("swarmctl.bus.network.router")
+    here.witness.wait(lambda: apart_m(here) < SILENT_FROM_M, 30.0, "on their way")
+    os.kill(router, signal.SIGSTOP)
+    time.sleep(3.5)  # a pause begins after 0.3 s
+    before_m = apart_m(here)
+    time.sleep(0.5)
+    after_m = apart_m(here)
+    os.kill(router, signal.SIGCONT)
+    assert launched.end(END_S) == 0, launched.text()
+    here.witness.wait(here.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
+    print(f"{after_m:.1f} m from each other at rest, {here.witness.min_separation_m():.2f} m at least later")
+    assert after_m > 3.0
+    assert abs(after_m - before_m) < 0.2, "they rest"
+    assert here.witness.min_separation_m() > BODIES_M
+
+
+def apart_m(here: Field) -> float:
+    """Return the true distance of the first two vehicles now."""
+    one, other = (here.witness.vehicles[index].pos_ned_m[-1] for index in (0, 1))
+    return math.dist(one, other)
 
 
 def test_a_pilot_has_the_vehicle_until_resume(field: Fielder) -> None:

@@ -21,7 +21,8 @@ from swarmctl.wall_clock import WallClock
 _REPEAT_US = 1_000_000
 _KNOWN_BY = 3  # messages, of which one has come without delay: the clock of their sender is known then
 _KEPT = 10  # messages of each sender by which it is known, so that a step of it is noticed
-_SAME_CLOCK_US, _UNKNOWN_CLOCK_US = 50_000, 500_000  # differences that are none, of clocks that are known or not
+_SAME_CLOCK_US = 100_000  # of a clock that is known: messages wait for a step of the launch
+_UNKNOWN_CLOCK_US = 500_000  # of one that is not yet
 _CORRECTED_US = 20_000  # change of the clock after which moving obstacles are stamped anew; 2 cm at 1 m/s
 _TELL_AT = 3  # repetitions of another list, after which it is told: it may still come from its operator
 

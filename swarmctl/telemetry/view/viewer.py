@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import psutil
 
@@ -39,7 +39,7 @@ _REDRAW_PERIOD_S = 5.0  # period of obstacles at rest, because the server's hist
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run until SIGTERM; returns the exit code."""
+    """Run until SIGTERM; returns the exit code of what could not begin."""
     options = _parser().parse_args(arguments)
     give_way()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"viewer: --flight: {error}", file=sys.stderr)
         return EXIT_USAGE
     try:
-        return _run(options, flight, stop)
+        _run(options, flight, stop)
     except SwarmError as error:
         print(f"viewer: {error}", file=sys.stderr)
         return error.exit_code
@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(options: argparse.Namespace, flight: ViewedFlight, stop: StopRequest) -> int:
+def _run(options: argparse.Namespace, flight: ViewedFlight, stop: StopRequest) -> NoReturn:
     from swarmctl.bus.network.joining import join_bus
     from swarmctl.bus.network.roster import identity_of_json
     from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
@@ -111,7 +111,6 @@ def _run(options: argparse.Namespace, flight: ViewedFlight, stop: StopRequest) -
         threading.Thread(target=_serve_page, args=(url, options.run_dir / "web.log", stop), daemon=True).start()
     Pump(feed, scene, flight.obstacles).run(1.0 / options.rate_hz, stop)
     _end(rec, bus, f"telemetry lost={feed.lost} received={feed.received} malformed={feed.malformed}")
-    return EXIT_OK
 
 
 class Pump:
@@ -239,8 +238,11 @@ def _serve_page(url: str, log: Path, stop: StopRequest) -> None:
         print(f"viewer: {error}", file=sys.stderr, flush=True)
 
 
-def _end(rec: Any, bus: Any, last_line: str) -> None:
-    """Close stream and bus within a bounded time, because flush and disconnect hang while a viewer is frozen."""
+def _end(rec: Any, bus: Any, last_line: str) -> NoReturn:
+    """Close stream and bus within a bounded time, because flush and disconnect hang while a viewer is frozen.
+
+    Then end the process at once: a thread of theirs that is about to call Python would abort it as Python ends.
+    """
     watchdog = threading.Timer(_EXIT_TIMEOUT_S, os._exit, [EXIT_OK])
     watchdog.daemon = True
     watchdog.start()
@@ -251,7 +253,7 @@ def _end(rec: Any, bus: Any, last_line: str) -> None:
         print(f"viewer: flush: {error}", file=sys.stderr, flush=True)
     rec.disconnect()
     bus.close()
-    watchdog.cancel()
+    os._exit(EXIT_OK)
 
 
 if __name__ == "__main__":

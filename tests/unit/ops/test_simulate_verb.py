@@ -89,7 +89,14 @@ def test_ctrl_c_while_modules_are_imported_is_an_interruption(verb: str, tmp_pat
     folder = ("--set", "mission.circle.radius_m=2,3", "--out") if verb == "sweep" else ("--run-dir",)
     command = [sys.executable, "-m", "swarmctl", verb, *folder, str(tmp_path / "run")]
     where = {**os.environ, "PYTHONPROFILEIMPORTTIME": "1"}  # prints what is imported, as it is
-    process = subprocess.Popen(command, env=where, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command,
+        env=where,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored in the background of a shell
+    )
     assert process.stderr is not None
     told = []
     for line in process.stderr:
