@@ -47,7 +47,7 @@ class PeerTrajectories:
         self._memory: dict[str, Memory] = {}
         self._used_error_us: dict[str, int] = {}  # of the clock of each peer, since its trajectories were decoded anew
         self._stamps_us: dict[int, deque[int]] = {}  # of the last messages of each peer, oldest first
-        self.peers = len(self._verifiers)  # heard or not
+        self.peer_count = len(self._verifiers)  # heard or not
         self.newest: dict[int, TrajectoryMessage] = {}
         self.telling: dict[int, TrajectoryMessage] = {}  # the newest of each peer that says what it has heard
         self.received_utc_us: dict[int, int] = {}  # when the newest message of each peer was accepted

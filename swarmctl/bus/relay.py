@@ -109,7 +109,7 @@ def missed_by_peers(
     received_us: Mapping[int, int],
     utc_us: int,
     *,
-    peers: int,
+    peer_count: int,
     period_us: int,
     far_us: int,
     lacked_us: Callable[[TrajectoryMessage, int, int], int],
@@ -129,7 +129,7 @@ def missed_by_peers(
         telling: the newest of each peer that says what it has heard.
         received_us: when the newest arrived here.
         utc_us: now.
-        peers: how many every agent has, heard or not.
+        peer_count: how many peers every agent has, heard or not.
         period_us: of every agent's messages.
         far_us: of those that the far ones hear, too; 0: all hear all.
         lacked_us: returns for how long, by its newest message, a peer has lacked what another sent after a stamp.
@@ -140,7 +140,7 @@ def missed_by_peers(
         if utc_us - received_us[peer] > (period_us if far_us else _HELPED_US) or message is not newest[peer]:
             continue  # where not every message says what was heard, each is looked at once
         far = message.reach.far
-        has_heard_all = len(message.heard) >= peers - len(far)
+        has_heard_all = len(message.heard) >= peer_count - len(far)
         if has_heard_all and _heard_lately(message, rare_us if own in far else near_us):
             continue  # as nearly always
         heard = dict(message.heard.items())

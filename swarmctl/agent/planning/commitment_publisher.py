@@ -141,7 +141,7 @@ class CommitmentPublisher:
             peers.telling,
             peers.received_utc_us,
             utc_us,
-            peers=peers.peers,
+            peer_count=peers.peer_count,
             period_us=self._period_us,
             far_us=self._far_us,
             lacked_us=peers.lacked_us,

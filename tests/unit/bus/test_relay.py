@@ -139,7 +139,7 @@ def missed(
         newest,
         arrivals_us,
         NOW_US,
-        peers=len(newest) + unheard,
+        peer_count=len(newest) + unheard,
         period_us=period_us,
         far_us=far_us,
         lacked_us=lambda *_: lacked_us,
@@ -234,7 +234,9 @@ def test_who_helps_differs_from_agent_to_agent() -> None:
         args = (own, others, others, dict.fromkeys(others, NOW_US), NOW_US)
         counts.append(
             len(
-                missed_by_peers(*args, peers=len(others), period_us=PERIOD_US, far_us=0, lacked_us=lambda *_: 1_000_000)
+                missed_by_peers(
+                    *args, peer_count=len(others), period_us=PERIOD_US, far_us=0, lacked_us=lambda *_: 1_000_000
+                )
             )
         )
     assert sum(counts) == 2 * (len(lost) - 1)
