@@ -45,6 +45,16 @@ def away(phase: Phase, seconds: float) -> Flight:
     return flight
 
 
+def held_on_its_way_down() -> Flight:
+    """Return a flight whose vehicle a pilot holds while its autopilot lands it."""
+    flight = Flight().until(Phase.LAND)
+    flight.flight_mode = FlightMode.LAND
+    flight.step()
+    flight.flight_mode = FlightMode.HOLD
+    flight.run(1.0)
+    return flight
+
+
 @pytest.mark.parametrize("phase", [Phase.READY, Phase.GOTO_LAND])
 def test_a_vehicle_given_back_outside_of_the_mission_is_asked_for_and_goes_on(phase: Phase) -> None:
     flight = away(phase, 5.0)
@@ -195,11 +205,7 @@ def test_a_landing_that_a_pilot_interrupts_is_taken_back_and_flown_to_where_ther
 
 
 def test_a_vehicle_that_its_pilot_has_put_down_is_disarmed_after_a_resume_and_not_flown() -> None:
-    flight = Flight().until(Phase.LAND)
-    flight.flight_mode = FlightMode.LAND
-    flight.step()
-    flight.flight_mode = FlightMode.HOLD
-    flight.run(1.0)
+    flight = held_on_its_way_down()
     flight.landed = Landed.ON_GROUND
     assert flight.ask("resume") == ""
     assert flight.run(0.5) == [Verb.DISARM]
@@ -233,11 +239,7 @@ def test_a_climb_that_its_autopilot_ends_near_its_height_goes_on() -> None:
 
 
 def test_a_landing_that_can_not_be_had_back_is_landed_all_the_same() -> None:
-    flight = Flight().until(Phase.LAND)
-    flight.flight_mode = FlightMode.LAND
-    flight.step()
-    flight.flight_mode = FlightMode.HOLD
-    flight.run(1.0)
+    flight = held_on_its_way_down()
     assert flight.ask("resume") == ""
     assert set(flight.run(4.5)) == {Verb.EXTERNAL}
     assert Verb.LAND in flight.run(10.0)
