@@ -199,6 +199,7 @@ class Agent:
         # What a tick decides and records is of `now_us`, in UTC too, also where it is held up on the way.
         stopwatch_ns = self._ports.stopwatch_ns
         began_ns = stopwatch_ns()
+        self._ports.clock.begin_tick(now_us)
         self._deadlines.update(now_us, deadline_misses, self._ports.autopilot.setpoint_loss_s)
         self._receive(now_us)
         state = self._sense(now_us)
@@ -209,7 +210,7 @@ class Agent:
         flown = self._decide(now_us, state, planning)
         setpoint = self._act(now_us, state, flown, planning)
         self.timing = self._timing(began_ns, sensed_ns, planned_ns, stopwatch_ns(), planning.plan)
-        self._share(state, flown)
+        self._share(now_us, state, flown)
         self._advance(now_us, state)
         self._report_refusals(now_us)
         self._publisher.active_alert = self._alerts.newest(now_us)
@@ -308,10 +309,11 @@ class Agent:
             self._deadlines.sent(now_us)
         return setpoint
 
-    def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
+    def _share(self, now_us: int, state: VehicleState | None, flown: Plan | None) -> None:
         """Publish the predicted path, and what the separation policy has to say."""
         jump_m, accuracy_m = self._ports.autopilot.frame.margin_m, self._vehicle_watch.accuracy.margin_m
         self._path_publisher.publish(
+            now_us,
             state,
             flown,
             self._publisher.seq,

@@ -12,7 +12,7 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.bus.topics import OPERATOR
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config
-from swarmctl.core.clock import Clock
+from swarmctl.core.clock import Clock, TickClock
 from swarmctl.core.mavlink_values import AUTOPILOT_COMPID
 from swarmctl.core.types import GeoOrigin
 from swarmctl.flown_code import code_in_words
@@ -56,7 +56,7 @@ def make_agent(
         autopilot=autopilot,
         commands=commands,
         bus=bus,
-        clock=clock,
+        clock=TickClock(clock),
         sink=sink,
         stopwatch_ns=stopwatch_ns,
         rehearses=rehearses,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.bus.traffic import CountedBus
-from swarmctl.core.clock import Clock
+from swarmctl.core.clock import TickClock
 from swarmctl.core.types import Plan
 from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.vehicle.autopilot import Autopilot
@@ -38,7 +38,7 @@ class Ports:
     autopilot: Autopilot  # the vehicle's hot path: states in, setpoints out
     commands: CommandPort  # executes the slow path: arming, modes, parameters
     bus: CountedBus  # to peers and operator
-    clock: Clock  # monotonic time and UTC [us]
+    clock: TickClock  # monotonic time and UTC [us]
     sink: TickSink  # records ticks and events
     stopwatch_ns: Callable[[], int]  # measures the tick and never influences it
     rehearses: bool = True  # plans on the ground as in the air; of use only where time passes while an agent computes

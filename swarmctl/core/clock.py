@@ -54,6 +54,31 @@ class ClockError:
     drift_ppm: float = 0.0  # gain on true UTC, > -1e6
 
 
+class TickClock:
+    """A clock with one difference of UTC from monotonic time in all that a tick does.
+
+    A host's two clocks are read one after the other, so that the difference is another one by microseconds whenever it
+    is measured. Decisions that follow from it could not be repeated from a recording, which has one UTC of each tick.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self.begin_tick(clock.now_us())
+
+    def begin_tick(self, now_us: int) -> None:
+        """Take over the difference that there is at monotonic time `now_us`."""
+        self._ahead_us = self._clock.utc_of_us(now_us) - now_us
+
+    def now_us(self) -> int:
+        return self._clock.now_us()
+
+    def utc_us(self) -> int:
+        return self._clock.now_us() + self._ahead_us
+
+    def utc_of_us(self, t_us: int) -> int:
+        return t_us + self._ahead_us
+
+
 class OffsetClock:
     """A clock whose UTC is wrong by `error`; its monotonic time is that of `clock`."""
 

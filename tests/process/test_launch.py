@@ -98,6 +98,8 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     for agent in decisions_of_run(launched.run_dir, ()):
         assert agent.phases_differ == 0, "each frame came a tick late, and with it every change of phase"
         assert not agent.differences, "messages came to other ticks than they had, up to 4 degrees off"
+        apart = agent.tilt_rad["max"], agent.thrust_01["max"]
+        assert apart == (0.0, 0.0), "a microsecond of UTC was another one; in a minute it grows to a degree"
 
 
 def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start, tmp_path: Path) -> None:

@@ -59,6 +59,7 @@ class PathPublisher:
 
     def publish(
         self,
+        now_us: int,
         state: VehicleState | None,
         flown: Plan | None,
         seq: int,
@@ -70,6 +71,7 @@ class PathPublisher:
         """Publish the path of this tick, if peers need it and it is known where the vehicle is.
 
         Args:
+            now_us: monotonic time of the tick.
             state: newest state.
             flown: plan that is flown, None when the autopilot flies.
             seq: number of the tick.
@@ -80,15 +82,15 @@ class PathPublisher:
         if flown is None or not self._widens_in_gusts:
             self._gust.forget()
         else:
-            self._gust.update(self._ports.clock.now_us(), disturbance_ned_m_s2)
-        if state is None or (flown is None and not (self._is_recent(state) or self._coasts(state))):
+            self._gust.update(now_us, disturbance_ned_m_s2)
+        if state is None or (flown is None and not (self._is_recent(now_us, state) or self._coasts(now_us, state))):
             return
-        margin_m, now_us = ordered_sum((*margins_m, self._gust.margin_m)), self._ports.clock.now_us()
+        margin_m = ordered_sum((*margins_m, self._gust.margin_m))
         is_known = as_committed and flown is not None and margin_m == self._margin_m
         if is_known and now_us - self._published_us < _COMMITTED_EVERY_US:
             return
         self._published_us, self._margin_m = now_us, margin_m
-        path = self._path(state, flown, seq, margin_m)
+        path = self._path(now_us, state, flown, seq, margin_m)
         for_all = self._far.include(path, now_us)
         message = self._sharing.message(path, for_all=for_all)
         if message is not None:
@@ -99,31 +101,30 @@ class PathPublisher:
         """Speed that the vehicle keeps to, as those out of reach have been told."""
         return self._far.told_m_s
 
-    def _is_recent(self, state: VehicleState) -> bool:
+    def _is_recent(self, now_us: int, state: VehicleState) -> bool:
         """Return whether a state may be continued: peers could not tell that a path from it is older than it says."""
-        return self._ports.clock.now_us() - state.t_us <= self._max_age_us
+        return now_us - state.t_us <= self._max_age_us
 
-    def _coasts(self, state: VehicleState) -> bool:
+    def _coasts(self, now_us: int, state: VehicleState) -> bool:
         """Return whether a vehicle of which nothing is heard still flies on as its autopilot does without a link."""
         coasts_s = self._ports.autopilot.landing_delay_s
         if coasts_s is None or self._ports.autopilot.setpoint_loss_s is None or state.mode is not FlightMode.EXTERNAL:
             return False
         brakes_s = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)) / BRAKE_M_S2 + ANSWER_S
-        return self._ports.clock.now_us() - state.t_us <= (coasts_s + brakes_s) * 1e6
+        return now_us - state.t_us <= (coasts_s + brakes_s) * 1e6
 
-    def _path(self, state: VehicleState, flown: Plan | None, seq: int, margin_m: float) -> PredictedPath:
+    def _path(self, now_us: int, state: VehicleState, flown: Plan | None, seq: int, margin_m: float) -> PredictedPath:
         if flown is not None:
             self._stop_judge.forget()
-            self._flown = flown, self._ports.clock.now_us() + self._delay_us
+            self._flown = flown, now_us + self._delay_us
             t0_us, dt_us, pos = flown.t0_us, flown.dt_us, flown.pos_ned_m
-            heard_us = self._ports.autopilot.unheard_since_us(self._ports.clock.now_us())
+            heard_us = self._ports.autopilot.unheard_since_us(now_us)
             if heard_us is not None:
                 pos, apart_m = self._unheard(state, flown, heard_us)
                 margin_m += apart_m
         else:
-            now_us = self._ports.clock.now_us()
             t0_us, dt_us = now_us + self._delay_us, self._dt_us
-            if self._is_recent(state):
+            if self._is_recent(now_us, state):
                 stops, ahead_s = self._stop_judge.update(state), self._ahead_s(t0_us, state.t_us)
                 brake_m_s2 = self._setup.separation.brake_m_s2
                 pos = predict_flown_by_others(state, ahead_s, brake_m_s2, stops=stops, drag_1_s=self._drag_1_s)

@@ -256,7 +256,7 @@ def _state(row: NDArray[np.void]) -> VehicleState:
     """Return the state of a vehicle that its agent does not fly, as far as its path follows from it."""
     age_us = float(row["state_age_ms"]) * 1e3
     return VehicleState(
-        t_us=int(row["t_us"] - age_us),
+        t_us=int(row["t_us"]) - round(age_us),
         pos_ned_m=row["pos_ned_m"],
         vel_ned_m_s=row["vel_ned_m_s"],
         q_nb=row["q_nb"],
