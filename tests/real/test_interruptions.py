@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 
+import numpy as np
 import pyarrow.parquet as pq
 import pymap3d
 import pytest
@@ -29,6 +30,7 @@ from tests.real.test_flights import (
     LONE_PX4,
     PX4_CONFIG,
     TAKEOFF_HEIGHT,
+    THREE_ARDUCOPTERS,
     booted,
 )
 
@@ -39,7 +41,13 @@ PHASES = ("CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK"
 CLIMBED_M, START_HEIGHT_M, HIGH_M = 0.5, 2.0, 15.0
 MOVED_M_S = 2.0  # by a ground station, in hold
 STRAYED_M = 20.0  # from the middle of the circle; followed for 40 s, the lost position led 180 m away
+TWO_ARDUCOPTERS = (
+    "--set=swarm.agents=2",
+    '--set=vehicles=[{sysid=1, url="udpin://127.0.0.1:14550"}, {sysid=2, url="udpin://127.0.0.1:14560"}]',
+)
+CHATTERING = "tests.benches.misbehaving:Chattering"
 SILENT_FROM_M = 13.0  # of two at 2.3 m/s each
+UPRIGHT_DEG = 25.0  # it asks for 30 to either side; without the guard the simulated vehicle turns over
 STOPPED_S = 60.0  # within which nothing is armed any more, or it is named
 
 
@@ -77,11 +85,13 @@ def test_a_killed_agent_ends_with_its_vehicle_on_the_ground_and_the_others_finis
     assert here.witness.min_separation_m() > BODIES_M
 
 
-def test_two_that_hear_nobody_any_more_stop_where_they_do_not_meet(field: Fielder) -> None:
+@pytest.mark.parametrize("kind", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
+def test_two_that_hear_nobody_any_more_stop_where_they_do_not_meet(field: Fielder, kind: Kind) -> None:
     """They come at each other, and would meet if they stopped as transits do, at half of `accel_m_s2`."""
-    here = field(PX4, 2)
+    here = field(PX4, 2) if kind is PX4 else booted(field, 2)
     swap = ("mission.kind=swap", "mission.swap.travel_s=12", "start.positions_ned_m=[[10,0,-3],[-10,0,-3]]")
-    launched = here.launch(PX4_CONFIG, "--agents", "2", *(f"--set={each}" for each in swap), "--duration", "40")
+    config = (PX4_CONFIG, "--agents", "2") if kind is PX4 else (THREE_ARDUCOPTERS, *TWO_ARDUCOPTERS)
+    launched = here.launch(*config, *(f"--set={each}" for each in swap), "--duration", "40")
     launched.until_phase("TRACK", 2)
     router = launched.pid_of("swarmctl.bus.network.router")
     here.witness.wait(lambda: apart_m(here) < SILENT_FROM_M, 30.0, "on their way")
@@ -97,6 +107,21 @@ def test_two_that_hear_nobody_any_more_stop_where_they_do_not_meet(field: Fielde
     assert after_m > 3.0
     assert abs(after_m - before_m) < 0.2, "they rest"
     assert here.witness.min_separation_m() > BODIES_M
+
+
+@pytest.mark.parametrize("kind", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
+def test_a_controller_that_chatters_is_not_flown_and_its_vehicle_lands(field: Fielder, kind: Kind) -> None:
+    here = field(PX4, 1) if kind is PX4 else booted(field, 1)
+    config = (PX4_CONFIG, *LONE_PX4) if kind is PX4 else (ARDUPILOT_CONFIG,)
+    launched = here.launch(*config, f"--set=controller.kind={CHATTERING}", "--set=mission.kind=hover", "--duration=20")
+    assert launched.end(END_S) == EXIT_MISSION, launched.text()
+    assert f"controller {CHATTERING} tilts to and fro faster than the vehicle follows" in launched.text()
+    here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
+    table = pq.read_table(launched.run_dir / "agent-0.parquet", columns=["q_nb_x", "q_nb_y"])
+    x, y = (table.column(name).to_numpy().astype(float) for name in table.column_names)
+    tilt_deg = math.degrees(math.acos(1.0 - 2.0 * float((x * x + y * y)[np.isfinite(x)].max())))
+    print(f"largest tilt {tilt_deg:.0f} deg, {tracked_s(launched, 0):.1f} s of the mission")
+    assert tilt_deg < UPRIGHT_DEG
 
 
 def apart_m(here: Field) -> float:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 import time
+from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
+from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED
 from tests.real.autopilots import ARDUCOPTER, PX4, Kind
 from tests.real.conftest import Field, Fielder
-from tests.real.test_flights import ARDUPILOT_CONFIG, END_S, GROUND_S, LONE_PX4, PX4_CONFIG, booted
+from tests.real.test_flights import ARDUPILOT_CONFIG, BODIES_M, END_S, GROUND_S, LONE_PX4, PX4_CONFIG, booted
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 
@@ -19,6 +22,19 @@ CLIMBED_M = 0.5
 STOPPED_S = {PX4.variable: 1.5, ARDUCOPTER.variable: 4.0}  # from the order until it hovers, its way included
 RESTED_S = 4.0
 DRIFT_M = 0.5
+FLOWN_S = 12.0
+FIGURE_8 = f"""
+[mission]
+kind = "lemniscate"
+duration_s = {FLOWN_S}
+
+[mission.lemniscate]
+center_ned_m = [0.0, 0.0, -4.0]
+length_m = 4.0
+width_m = 2.0
+omega_rad_s = 0.5
+"""
+TOGETHER_US = 1000
 NEAR_M = 1.0  # true positions are up to 0.6 m off the estimate
 
 
@@ -55,3 +71,28 @@ def test_a_climb_is_held_then_flown_on_and_a_point_is_flown_to(field: Fielder, k
     assert landed.returncode == 0, landed.stderr
     assert launched.end(END_S) == EXIT_INTERRUPTED, launched.text()
     here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
+
+
+def test_another_mission_is_begun_by_all_at_one_time(field: Fielder, tmp_path: Path) -> None:
+    here = field(PX4, 3)
+    launched = here.launch(PX4_CONFIG)
+    launched.until_phase("TRACK", 3)
+    time.sleep(4.0)
+    file = tmp_path / "figure_8.toml"
+    file.write_text(FIGURE_8)
+    changed = launched.verb("mission", "set", str(file))
+    assert changed.returncode == 0, changed.stderr
+    assert launched.end(END_S) == 0, launched.text()
+    here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
+    begun_us, flown_s = list[int](), list[float]()
+    for agent in range(3):
+        table = pq.read_table(launched.run_dir / f"agent-{agent}.parquet", columns=["utc_us", "phase", "mission_t_s"])
+        utc_us, phase, mission_s = (table.column(name).to_numpy() for name in table.column_names)
+        tracks = phase == Phase.TRACK
+        (back,) = np.flatnonzero(np.diff(mission_s[tracks]) < 0.0)
+        begun_us.append(round(utc_us[tracks][back + 1] - 1e6 * mission_s[tracks][back + 1]))
+        flown_s.append(float(mission_s[tracks][-1]))
+    print(f"begun within {max(begun_us) - min(begun_us)} us; {here.witness.min_separation_m():.2f} m at least")
+    assert max(begun_us) - min(begun_us) < TOGETHER_US
+    assert min(flown_s) == pytest.approx(FLOWN_S, abs=0.5)
+    assert here.witness.min_separation_m() > BODIES_M
