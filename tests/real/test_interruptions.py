@@ -45,6 +45,9 @@ TWO_ARDUCOPTERS = (
     "--set=swarm.agents=2",
     '--set=vehicles=[{sysid=1, url="udpin://127.0.0.1:14550"}, {sysid=2, url="udpin://127.0.0.1:14560"}]',
 )
+LEAST_CHARGE, FULL_PERCENT = "SIM_BAT_MIN_PCT", 90.0  # to which a simulated PX4's battery is drained, in 6 s
+WORN_S = 14.0  # within which another 5 % are used up, and taken for worn
+PASSED_M = 4.0
 CHATTERING = "tests.benches.misbehaving:Chattering"
 SILENT_FROM_M = 13.0  # of two at 2.3 m/s each
 UPRIGHT_DEG = 25.0  # it asks for 30 to either side; without the guard the simulated vehicle turns over
@@ -107,6 +110,43 @@ def test_two_that_hear_nobody_any_more_stop_where_they_do_not_meet(field: Fielde
     assert after_m > 3.0
     assert abs(after_m - before_m) < 0.2, "they rest"
     assert here.witness.min_separation_m() > BODIES_M
+
+
+def test_worn_batteries_lead_nobody_home_past_who_it_does_not_hear(field: Fielder) -> None:
+    """They have passed each other, and their ways home would meet."""
+    here = field(PX4, 2)
+    here.witness.wait(lambda: all(v.beats for v in here.witness.vehicles), 20.0, "heartbeats")
+    for index in range(2):
+        here.witness.set_parameter(index, LEAST_CHARGE, FULL_PERCENT)
+        assert here.witness.read_parameter(index, LEAST_CHARGE) == FULL_PERCENT
+    swap = ("mission.kind=swap", "mission.swap.travel_s=12", "start.positions_ned_m=[[10,0,-3],[-10,0,-3]]")
+    worn = ("agent.failsafe.battery_warn_01=0.87", "agent.failsafe.battery_rtl_01=0.85")
+    sets = (f"--set={each}" for each in (*swap, *worn))
+    launched = here.launch(PX4_CONFIG, "--agents", "2", *sets, "--duration", "40")
+    launched.until_phase("TRACK", 2)
+    router = launched.pid_of("swarmctl.bus.network.router")
+    here.witness.wait(lambda: ahead_m(here) > PASSED_M, 30.0, "past each other")
+    os.kill(router, signal.SIGSTOP)
+    for index in range(2):
+        here.witness.set_parameter(index, LEAST_CHARGE, 10.0)
+    time.sleep(WORN_S)
+    before_m = apart_m(here)
+    time.sleep(4.0)
+    after_m, heard_us = apart_m(here), time.time_ns() // 1000
+    os.kill(router, signal.SIGCONT)
+    assert launched.end(END_S) == EXIT_MISSION, launched.text()
+    here.witness.wait(here.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
+    print(f"{after_m:.1f} m from each other at rest, {here.witness.min_separation_m():.2f} m at least")
+    for agent in ("agent-0", "agent-1"):
+        (turned_us,) = (row["utc_us"] for row in launched.events("escalation", agent) if row["response"] == "RTL")
+        assert turned_us < heard_us - 4e6, "its battery was worn before"
+    assert abs(after_m - before_m) < 0.3, "they rest"
+    assert here.witness.min_separation_m() > BODIES_M
+
+
+def ahead_m(here: Field) -> float:
+    """Return how far the second vehicle, which began south of the first one, is north of it now."""
+    return here.witness.vehicles[1].pos_ned_m[-1][0] - here.witness.vehicles[0].pos_ned_m[-1][0]
 
 
 @pytest.mark.parametrize("kind", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
