@@ -26,12 +26,12 @@ from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.relay import RelayingBus
 from swarmctl.bus.silence import SessionWatch
 from swarmctl.bus.traffic import CountedBus
-from swarmctl.bus.zenoh_bus import NO_BUS
+from swarmctl.bus.zenoh_bus import NO_BUS, socket_file
 from swarmctl.config import Config, load, own_identity
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Mode
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, ConfigError, MissionError, StartError
 from swarmctl.mavlink.codec import heartbeat_of
 from swarmctl.mavlink.commands import OWN_COMPID
 from swarmctl.mavlink.forwarding import Forwarding
@@ -127,7 +127,7 @@ def run_agent(process: AgentProcess) -> int:
 
     Raises:
         StartError: link, bus or vehicle can't be reached.
-        ConfigError: the configuration is not valid.
+        ConfigError: the configuration is not valid, has no such agent, or the bus is no endpoint.
     """
     stop = StopRequest(signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     clock = WallClock()
@@ -169,12 +169,14 @@ def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> 
 
     Raises:
         StartError: link, bus or vehicle can't be reached.
-        ConfigError: the configuration is not valid.
+        ConfigError: the configuration is not valid, has no such agent, or the bus is no endpoint.
     """
     agent = process.agent
     config = load(process.config_path, only_agents=(agent,))
     if not 0 <= agent < config.swarm.agents:
-        raise StartError(f"--id {agent}: allowed: 0..{config.swarm.agents - 1} (swarm.agents)")
+        raise ConfigError(f"--id {agent}", [f"allowed: 0..{config.swarm.agents - 1} (swarm.agents)"])
+    if process.bus != NO_BUS:
+        socket_file(process.bus)
     if process.only_land:
         stop.ask()
     key = read_own_key(config.mavlink.signing_keys, agent)

@@ -25,7 +25,7 @@ from swarmctl.bus.marked_keys import Inbox, MarkedPublisher, drain
 from swarmctl.bus.refusals import MISDELIVERED, MOST_REFUSED, RefusedMessage
 from swarmctl.bus.silence import DEAF_S, SilenceWatch
 from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError
 
 SCHEME = "unixsock-stream/"
 NO_BUS = "none"  # endpoint of an agent without a bus
@@ -258,11 +258,12 @@ def socket_file(endpoint: str) -> Path:
     """Return the path of a Unix socket endpoint.
 
     Raises:
-        StartError: the endpoint is of another kind, or its path too long for the kernel.
+        ConfigError: the endpoint is of another kind.
+        StartError: its path is too long for the kernel, as in a long TMPDIR.
     """
     path = endpoint.removeprefix(SCHEME)
     if path == endpoint or not path.startswith("/"):
-        raise StartError(f"bus endpoint {endpoint!r}: use {SCHEME}/ABSOLUTE/PATH")
+        raise ConfigError(f"bus endpoint {endpoint!r}", [f"is of another kind; use {SCHEME}/ABSOLUTE/PATH"])
     if len(path.encode()) > _MAX_SOCKET_PATH:
         raise StartError(
             f"bus endpoint {endpoint!r}: path longer than {_MAX_SOCKET_PATH} bytes; set TMPDIR to a shorter directory"

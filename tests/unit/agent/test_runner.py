@@ -17,7 +17,7 @@ from swarmctl.config import load
 from swarmctl.core.clock import SimClock
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Mode
-from swarmctl.errors import EXIT_OK, MissionError, StartError
+from swarmctl.errors import EXIT_OK, ConfigError, MissionError, StartError
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.wall_clock import WallClock, monotonic_us
 
@@ -131,13 +131,25 @@ def test_each_session_that_was_replaced_is_recorded_once() -> None:
     assert noted == [("bus_reopened", 1), ("bus_reopened", 3)]
 
 
-def test_an_agent_number_outside_the_swarm_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("agent", "bus", "said"),
+    [
+        (2, "none", r"--id 2: allowed: 0\.\.1"),
+        (-1, "none", r"--id -1: allowed: 0\.\.1"),
+        *((0, bus, "use unixsock-stream//ABSOLUTE/PATH") for bus in ("tcp/127.0.0.1:1", "", "unixsock-stream/here")),
+    ],
+)
+def test_an_agent_or_a_bus_that_there_cannot_be_is_bad_usage_and_refused_before_anything_is_opened(
+    tmp_path: Path, agent: int, bus: str, said: str
+) -> None:
     from swarmctl.agent.runner import AgentProcess, run_agent
 
-    path = tmp_path / "config.toml"
+    path, run_dir = tmp_path / "config.toml", tmp_path / "run"
     path.write_text("[swarm]\nagents = 2\n", encoding="utf-8")
-    with pytest.raises(StartError, match=r"--id 2.*0\.\.1"):
-        run_agent(AgentProcess(config_path=path, agent=2, run="run", bus="tcp/127.0.0.1:1", run_dir=tmp_path))
+    run_dir.mkdir()
+    with pytest.raises(ConfigError, match=said):
+        run_agent(AgentProcess(config_path=path, agent=agent, run="run", bus=bus, run_dir=run_dir))
+    assert not list(run_dir.iterdir()), "a recorder was opened"
 
 
 @pytest.mark.parametrize("has_landed", [True, False])
