@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, Protocol
 from swarmctl.errors import StartError
 from swarmctl.mavlink.framing import FrameWriter, cut_frames
 from swarmctl.mavlink.latch import Address, Greeting, IsVehicle, Latch, admit_only, anybody, silence
+from swarmctl.mavlink.serial_devices import serial_problem
 from swarmctl.wall_clock import utc_us
 
 MAX_DATAGRAM = 2048
@@ -325,7 +326,7 @@ class SerialTransport:
             self._port: Any = open_port()
         except (OSError, ValueError) as error:  # SerialException is an OSError
             taken = isinstance(error, OSError) and error.errno in (errno.EWOULDBLOCK, errno.EBUSY)
-            why = "it is in use by another program; end that one" if taken else error
+            why = serial_problem(device) or ("it is in use by another program; end that one" if taken else error)
             raise StartError(f"serial {device} at {baud} baud can't be opened: {why}") from error
         self._lost_us: int | None = None
         self._lost = False

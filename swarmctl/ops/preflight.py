@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import os
 import re
 import socket
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from swarmctl.config import Config
 from swarmctl.errors import StartError
+from swarmctl.mavlink.serial_devices import serial_problem
 from swarmctl.mavlink.transport import bind_udp, parse_url
 from swarmctl.telemetry.view.view_ports import PORTS_TRIED, free_view_ports
 
@@ -29,7 +28,6 @@ _NEEDED = {
     "msgspec": (0, 19),
     "pyarrow": (18,),
 }
-_SERIAL_PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "serial[0-9]*")  # adapters, USB, UARTs of companions
 _NEEDED_TO_VIEW = {"rerun-sdk": (0, 41)}
 
 
@@ -106,22 +104,14 @@ def _package_problems(config: Config) -> Iterator[str]:
             yield f"package {name} = {found}: too old; pip install '{name}>={wanted}'"
 
 
-def _serial_ports() -> list[str]:
-    return sorted({str(path) for pattern in _SERIAL_PORTS for path in Path("/dev").glob(pattern)})
-
-
 def _vehicle_problems(config: Config, agents: Sequence[int]) -> Iterator[str]:
     for agent in agents:
         vehicle = config.vehicles[agent]
         endpoint = parse_url(vehicle.url)
         key = f"vehicles.{agent}.url = {vehicle.url!r}"
         if endpoint.scheme == "serial":
-            device = Path(endpoint.where)
-            if not device.exists():
-                here = ", ".join(_serial_ports()) or "none that is known by its name"
-                yield f"{key}: {endpoint.where} does not exist; serial ports here: {here}"
-            elif not os.access(device, os.R_OK | os.W_OK):
-                yield f"{key}: no permission to read and write; join the group that owns {endpoint.where}"
+            if problem := serial_problem(endpoint.where):
+                yield f"{key}: {problem}"
         elif endpoint.scheme == "udpin":
             try:
                 bind_udp(endpoint.where, endpoint.number).close()

@@ -142,6 +142,7 @@ class VehicleFacts:
     wanted_sysid: int
     unreachable: str  # why, or "" once its heartbeat was received
     link: LinkFacts
+    opened: bool = True  # the link could be, on this computer
     sysid: int = 0
     autopilot: str = ""  # name of the dialect; "" for an unsupported one
     autopilot_number: int = 0  # MAV_AUTOPILOT

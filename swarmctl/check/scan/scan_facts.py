@@ -44,7 +44,7 @@ def unreached(agent: int, url: str, wanted_sysid: int, why: str) -> VehicleFacts
         round_trip=None,
         time=None,
     )
-    return VehicleFacts(agent=agent, url=url, wanted_sysid=wanted_sysid, unreachable=why, link=link)
+    return VehicleFacts(agent=agent, url=url, wanted_sysid=wanted_sysid, unreachable=why, link=link, opened=False)
 
 
 def facts_of(

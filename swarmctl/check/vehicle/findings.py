@@ -52,6 +52,8 @@ def _unreached(facts: VehicleFacts) -> Finding:
         advice = f"something sends to {facts.url}, but no autopilot: check the address and the routing"
     if facts.link.refused:
         advice = _NO_KEY
+    if not facts.opened:
+        advice = f"vehicles.{facts.agent}.url names a link that this computer can't open"
     return Finding(
         agent=facts.agent,
         topic="link",

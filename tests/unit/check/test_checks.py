@@ -516,11 +516,20 @@ def test_a_clock_one_percent_slow_is_no_finding(config: Config) -> None:
 
 @pytest.mark.parametrize("url", (*URLS, "udpout://10.0.0.5:14580"))
 def test_silence_over_udp_names_the_first_sender_and_the_cure(config: Config, url: str) -> None:
-    advice = line_of(findings([unreached(0, url, 1, "nothing is heard")], config), "link").advice
+    silent = changed(unreached(0, url, 1, "nothing is heard"), opened=True)
+    advice = line_of(findings([silent], config), "link").advice
     assert "to its first sender" in advice
     assert "restart PX4" in advice
-    serial = line_of(findings([unreached(0, "serial:///dev/ttyACM0:921600", 1, "nothing")], config), "link")
+    serial = line_of(findings([changed(silent, url="serial:///dev/ttyACM0:921600")], config), "link")
+    assert "is it on" in serial.advice
     assert "to its first sender" not in serial.advice
+
+
+@pytest.mark.parametrize("url", (*URLS, "serial:///dev/ttyACM0:921600"))
+def test_a_link_that_this_computer_cannot_open_is_no_matter_of_the_vehicle(config: Config, url: str) -> None:
+    line = line_of(findings([unreached(0, url, 1, "it is not there")], config), "link")
+    assert line.found == "it is not there"
+    assert line.advice == "vehicles.0.url names a link that this computer can't open"
 
 
 def test_the_spread_of_origins_is_shown_and_harmless(config: Config) -> None:

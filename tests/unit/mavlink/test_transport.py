@@ -8,10 +8,12 @@ import socket
 import time
 import tty
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from swarmctl.errors import StartError
+from swarmctl.mavlink import serial_devices
 from swarmctl.mavlink.framing import cut_frames
 from swarmctl.mavlink.transport import (
     Endpoint,
@@ -249,6 +251,21 @@ def test_a_serial_port_is_opened_once() -> None:
     open_transport(url).close()
     os.close(master)
     os.close(slave)
+
+
+def test_a_serial_device_that_is_not_there_is_said_to_be_missing_and_which_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serial_devices, "_FOLDER", tmp_path)
+    (tmp_path / "ttyACM1").touch()
+    (tmp_path / "tty7").touch()
+    missing = tmp_path / "ttyUSB0"
+    with pytest.raises(StartError) as refused:
+        open_transport(f"serial://{missing}:57600")
+    assert str(refused.value) == (
+        f"serial {missing} at 57600 baud can't be opened: {missing} does not exist; "
+        f"serial ports here: {tmp_path}/ttyACM1. Plug it in, or name another"
+    )
 
 
 @pytest.mark.timeout(20)
