@@ -40,8 +40,8 @@ from swarmctl.wall_clock import utc_us
 
 def simulate(config: Config, directory: Path) -> int:
     """Fly `config` in lockstep into the run folder `directory` and return the exit code."""
-    write_config(directory, dump(config), "lockstep")
     with held_run(directory):
+        write_config(directory, dump(config), "lockstep")
         return _simulate(config, directory)
 
 

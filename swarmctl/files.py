@@ -66,14 +66,23 @@ def _why_not_private(status: os.stat_result) -> str:
     return ""
 
 
-def hold(fd: int) -> None:
-    """Mark an open file as one that is still written, until it is closed or the process ends; see `is_held`."""
-    with contextlib.suppress(OSError):  # a file system without locks must not cost what is written
+def hold(fd: int) -> bool:
+    """Mark an open file or folder as one that is still written, until it is closed or the process ends; see `is_held`.
+
+    Returns:
+        whether it is marked for this process; False: another one has marked it.
+    """
+    try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True  # a file system without locks must not cost what is written
+    return True
 
 
 def is_held(path: Path) -> bool:
-    """Return whether a process still writes to a file that it has marked; not known of one that can't be opened."""
+    """Return whether a process still writes to what it has marked; not known of what can't be opened."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError:

@@ -135,35 +135,36 @@ def started(config: Config, options: LaunchOptions, part: SwarmPart) -> Iterator
     """
     if options.web and not config.telemetry.enabled:
         raise ConfigError("--web", ["telemetry.enabled = false: there is no view"])
-    reserved = inspect(config, part.agents)
-    try:
-        directory = _run_folder(config, options)
-    except BaseException:
-        reserved.release()
-        raise
-    services = Launcher(config, options, reserved, directory, part=part)
-    try:
-        services.start()
-        yield services
-    except BaseException:
-        services.stop(_AGENTS_STOP_S)
-        withdraw()
-        raise
-    else:
-        services.stop(0.0)  # every agent has ended
-    finally:
-        services.display.close()
+    with contextlib.ExitStack() as held:
+        reserved = inspect(config, part.agents)
+        held.callback(reserved.release)
+        directory = held.enter_context(_run_folder(config, options))
+        services = Launcher(config, options, reserved, directory, part=part)
+        try:
+            services.start()
+            yield services
+        except BaseException:
+            services.stop(_AGENTS_STOP_S)
+            withdraw()
+            raise
+        else:
+            services.stop(0.0)  # every agent has ended
+        finally:
+            services.display.close()
 
 
-def _run_folder(config: Config, options: LaunchOptions) -> Path:
-    from swarmctl.telemetry.recording.run_folder import create_run_folder, write_config  # heavy
+@contextmanager
+def _run_folder(config: Config, options: LaunchOptions) -> Iterator[Path]:
+    """Yield the folder of a new run, with its configuration; no other run begins in it meanwhile."""
+    from swarmctl.telemetry.recording.run_folder import create_run_folder, held_run, write_config  # heavy
 
     directory = create_run_folder(options.run_dir, config.name, utc_us()).resolve()
-    try:
-        write_config(directory, dump(config))
-    except OSError as error:
-        raise StartError(f"{directory}: can't be written: {error}. Choose another with --run-dir") from error
-    return directory
+    with held_run(directory):
+        try:
+            write_config(directory, dump(config))
+        except OSError as error:
+            raise StartError(f"{directory}: can't be written: {error}. Choose another with --run-dir") from error
+        yield directory
 
 
 class Launcher(Services):

@@ -56,6 +56,7 @@ _OUTCOME_BYTES = 4096
 _PROBLEM_CHARACTERS = 500  # of a problem that is kept in it
 _LAUNCHES_PER_SECOND = 1000
 _TAKEN = frozenset((EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING, REPORT, STUDY_ROWS))
+_JUST_BEGUN = "another run has just begun there. Choose a new folder"
 
 _RAW_ROWS = (  # files of raw rows, the suffixes that they have as Parquet, and their columns
     ("agent-*.ticks", PACKED_TICKS, COLUMNS),
@@ -84,7 +85,11 @@ def create_run_folder(
     try:
         if base is not None:
             str(base).encode()  # names that are no text could be written to no file of the run
-            return _claim(base)
+            base.mkdir(parents=True, exist_ok=True)
+            _refuse_taken(base)
+            if is_held(base.resolve()):  # by a run that begins, and has no other files yet
+                raise ConfigError(f"--run-dir {base}", [_JUST_BEGUN])
+            return base
         stamp = datetime.fromtimestamp(utc_us / 1e6, UTC).strftime("%Y%m%dT%H%M%SZ")
         Path("runs").mkdir(exist_ok=True)
         for attempt in range(1, _LAUNCHES_PER_SECOND):
@@ -99,17 +104,18 @@ def create_run_folder(
     raise StartError(f"runs/{stamp}-{name}: {_LAUNCHES_PER_SECOND} launches in one second")
 
 
-def _claim(base: Path) -> Path:
-    base.mkdir(parents=True, exist_ok=True)
-    taken = sorted(path.name for path in base.iterdir() if path.name in _TAKEN or AGENT_FILE.match(path.name))
+def _refuse_taken(base: Path) -> None:
     links = sorted(path.name for path in base.iterdir() if path.is_symlink())
     if links:
         raise ConfigError(f"--run-dir {base}", [f"holds a symbolic link ({links[0]}). Choose a new folder or empty it"])
+    taken = sorted(path.name for path in base.iterdir() if _is_recorded(path.name))
     if taken:
         raise ConfigError(f"--run-dir {base}", [f"holds a run already ({taken[0]}). Choose a new folder or empty it"])
-    if is_held(base / OUTCOME):  # of a simulation that begins, and has no other files yet
-        raise ConfigError(f"--run-dir {base}", ["another simulation has just begun there. Choose a new folder"])
-    return base
+
+
+def _is_recorded(name: str) -> bool:
+    """Return whether a file of a run folder is there only once a run has begun."""
+    return name in _TAKEN or name.endswith(events_file("")) or bool(AGENT_FILE.match(name))
 
 
 def write_config(directory: Path, text: str, mode: RunMode = "realtime") -> None:
@@ -133,10 +139,21 @@ def write_config(directory: Path, text: str, mode: RunMode = "realtime") -> None
 
 @contextlib.contextmanager
 def held_run(directory: Path) -> Iterator[None]:
-    """Keep others from finishing a run whose rows are in memory; for the folder of `write_config`."""
-    with (directory / OUTCOME).open("rb") as file:
-        hold(file.fileno())
+    """Keep others from flying into the folder of a new run, and from finishing it while its rows are in memory.
+
+    Of several that begin at once in one folder, `create_run_folder` accepts each; one alone comes to hold it.
+
+    Raises:
+        ConfigError: another run has it, or had it meanwhile.
+    """
+    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        if not hold(fd):
+            raise ConfigError(f"--run-dir {directory}", [_JUST_BEGUN])
+        _refuse_taken(directory)
         yield
+    finally:
+        os.close(fd)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -293,8 +310,8 @@ def _refuse_recorded(directory: Path) -> None:
     Raises:
         StartError: somebody does.
     """
-    for pattern in ("*.ticks", "*.plans", "*.received", events_file("*"), TRUTH, OUTCOME):
-        for path in sorted(directory.glob(pattern)):
+    for pattern in ("*.ticks", "*.plans", "*.received", events_file("*"), TRUTH):
+        for path in (directory.resolve(), *sorted(directory.glob(pattern))):
             if is_held(path):
                 raise StartError(f"{path}: is still written: the run is not over. Wait until its agents have ended")
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier, Event
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -280,13 +283,44 @@ def test_report_of_a_run_whose_launcher_died_says_so(tmp_path: Path) -> None:
     assert summary["violations"] == ["the launcher did not finish this run"]
 
 
-def test_two_simulations_that_begin_at_once_share_no_folder(tmp_path: Path) -> None:
-    """Both flew, wrote over each other's files and ended with success."""
+def test_of_runs_that_begin_at_once_in_one_folder_one_alone_flies(tmp_path: Path) -> None:
+    """Each has found it empty; all flew, and wrote over each other's files."""
     folder = create_run_folder(tmp_path / "run", "x", 0)
     write_config(folder, "", "lockstep")
     assert create_run_folder(folder, "x", 0) == folder, "as by a script, which has a launch fly what it has written"
-    with held_run(folder), pytest.raises(ConfigError, match="another simulation has just begun there"):
-        create_run_folder(folder, "x", 0)
+    everybody, refused = Barrier(4), Event()
+
+    def fly(_: int) -> str:
+        found = create_run_folder(folder, "x", 0)
+        everybody.wait(10.0)
+        try:
+            with held_run(found):
+                write_config(found, "", "lockstep")
+                refused.wait(10.0)
+        except ConfigError as error:
+            said.append(str(error))
+            return "refused"
+        return "flew"
+
+    said: list[str] = []
+    with ThreadPoolExecutor(4) as pool:
+        ends = [pool.submit(fly, number) for number in range(4)]
+        while sum(end.done() for end in ends) < 3:
+            time.sleep(0.005)
+        with pytest.raises(ConfigError, match="another run has just begun there"):
+            create_run_folder(folder, "x", 0)
+        refused.set()
+    assert sorted(end.result() for end in ends) == ["flew", "refused", "refused", "refused"]
+    assert set(said) == {f"--run-dir {folder}: another run has just begun there. Choose a new folder"}
+
+
+@pytest.mark.parametrize("recorded", ["launch.events.jsonl", "agent-0.ticks", "summary.json"])
+def test_who_comes_late_does_not_fly_into_the_folder_of_a_run_that_has_been(tmp_path: Path, recorded: str) -> None:
+    """It had found the folder empty, and the other has let go of it."""
+    folder = create_run_folder(tmp_path / "run", "x", 0)
+    (folder / recorded).touch()
+    with pytest.raises(ConfigError, match=rf"holds a run already \({re.escape(recorded)}\)"), held_run(folder):
+        raise AssertionError("it flew")
 
 
 def test_a_simulation_that_was_cut_off_is_judged_as_one(tmp_path: Path) -> None:

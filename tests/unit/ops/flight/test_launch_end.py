@@ -18,7 +18,7 @@ from swarmctl.bus.topics import OPERATOR
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config
 from swarmctl.core.operator_verbs import Order
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops import running_launches
 from swarmctl.ops.flight import launch as launching
 from swarmctl.ops.flight.launch import Launcher, LaunchOptions, SwarmPart, judged
@@ -223,3 +223,18 @@ def test_a_launch_tells_verbs_its_clock_again_where_it_was_corrected(
         told_us.append(find_launch(str(tmp_path)).utc_ahead_us)
     launcher.display.close()
     assert told_us == [10**12, 10**12, 10**12 + 200_000], "1 % of the time that has passed, in steps of 0.1 s"
+
+
+def test_a_launch_holds_its_folder_until_its_agents_have_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two that begin at once in one folder the second is refused, and leaves no port bound."""
+    released = []
+    reserved = ReservedPorts(sockets=(), ports=(), view_port=0)
+    monkeypatch.setattr(launching, "inspect", lambda *_: reserved)
+    monkeypatch.setattr(ReservedPorts, "release", lambda _: released.append(1))
+    monkeypatch.setattr(Launcher, "start", lambda _: None)
+    options, part = LaunchOptions(tmp_path / "run"), SwarmPart(run="x", agents=(0,))
+    with launching.started(Config(), options, part):
+        (tmp_path / "run" / "launch.events.jsonl").unlink(missing_ok=True)  # as before it is written
+        with pytest.raises(ConfigError, match="another run has just begun"), launching.started(Config(), options, part):
+            raise AssertionError("it flew")
+        assert released, "the ports of the one that was refused"
