@@ -55,6 +55,10 @@ from swarmctl.telemetry.report.run_report import FIGURES, REPORT, write_figures,
 _OUTCOME_BYTES = 4096
 _PROBLEM_CHARACTERS = 500  # of a problem that is kept in it
 _LAUNCHES_PER_SECOND = 1000
+_NO_RUN = (
+    f"holds no run, only a {CONFIG}. A sweep that was cut off before its first flight had ended leaves no more: "
+    "it has nothing to report, and the same call of it goes on"
+)
 _TAKEN = frozenset((EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING, REPORT, STUDY_ROWS))
 _JUST_BEGUN = "another run has just begun there. Choose a new folder"
 
@@ -271,7 +275,10 @@ def report_run(directory: Path, rules: Rules) -> Path:
         raise ConfigError(str(directory), [f"holds a campaign or a sweep, whose page is {REPORT}, and no run"])
     if read_summary(directory) is None:
         _refuse_recorded(directory)
-        run, kept = load_run(directory), _kept_outcome(directory)
+        run = load_run(directory)
+        if not (run.ticks or run.events or len(run.truth) or (directory / OUTCOME).exists()):
+            raise ConfigError(str(directory), [_NO_RUN])
+        kept = _kept_outcome(directory)
         outcome = kept.as_outcome()
         problems = (*outcome.problems, *_cut_off(run, outcome))
         finished = finish_run(directory, replace(rules, mode=kept.mode), replace(outcome, problems=problems), run)

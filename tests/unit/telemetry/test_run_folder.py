@@ -431,6 +431,20 @@ def test_the_configuration_of_somebody_else_is_not_overwritten(tmp_path: Path) -
     assert (tmp_path / "config.toml").read_text() == "a = 1\n"
 
 
+def test_a_folder_with_nothing_but_a_configuration_is_no_run(tmp_path: Path) -> None:
+    """A sweep leaves that which ends before its first flight; it was reported as a run that has failed."""
+    (tmp_path / "config.toml").write_text(dump(Config()))
+    with pytest.raises(ConfigError, match=r"holds no run, only a config\.toml\. A sweep that was cut off before its"):
+        report_run(tmp_path, RULES)
+    assert [path.name for path in tmp_path.iterdir()] == ["config.toml"]
+
+
+def test_a_run_that_was_cut_off_before_anything_was_recorded_is_one(tmp_path: Path) -> None:
+    write_config(tmp_path, dump(Config()), "lockstep")
+    assert report_run(tmp_path, RULES).exists()
+    assert json.loads((tmp_path / "summary.json").read_text())["mode"] == "lockstep"
+
+
 def test_the_folder_of_a_campaign_or_sweep_is_no_run(tmp_path: Path) -> None:
     write_run(tmp_path, 1, 4.0)
     (tmp_path / "rows.parquet").write_bytes(b"")
