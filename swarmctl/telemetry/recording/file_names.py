@@ -8,7 +8,7 @@ from swarmctl.bus.bus import agent_name
 
 EVENTS = "events.jsonl"  # of all sources, in a finished run
 SUMMARY = "summary.json"
-OUTCOME = "outcome.json"  # how a run ended; there until everything is written
+OUTCOME = "outcome.json"  # how a run is flown, and how it ended
 TRUTH = "truth.bin"  # while the simulator flies
 PACKED_TICKS = ".parquet"  # of an agent in a finished run; while it flies, .ticks
 PACKED_PLANS = ".plans.parquet"  # likewise; while it flies, .plans

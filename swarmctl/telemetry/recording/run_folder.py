@@ -218,10 +218,7 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
         REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules=rules),
     }
     unwritten = write_each(writers)
-    if unwritten:
-        _keep_outcome(directory, outcome, rules.mode)
-    else:
-        (directory / OUTCOME).unlink(missing_ok=True)
+    _keep_outcome(directory, outcome, rules.mode)  # for what was not written, or is damaged or removed later
     return Finished(summary, unwritten)
 
 
@@ -280,8 +277,9 @@ def report_run(directory: Path, rules: Rules) -> Path:
             raise ConfigError(str(directory), [_NO_RUN])
         kept = _kept_outcome(directory)
         outcome = kept.as_outcome()
-        problems = (*outcome.problems, *_cut_off(run, outcome))
-        finished = finish_run(directory, replace(rules, mode=kept.mode), replace(outcome, problems=problems), run)
+        problems = dict.fromkeys((*outcome.problems, *_cut_off(run, outcome)))
+        ended = replace(outcome, problems=tuple(problems))
+        finished = finish_run(directory, replace(rules, mode=kept.mode), ended, run)
         if finished.unwritten:
             raise StartError(f"{directory}: can't be written: {'; '.join(finished.unwritten)}")
         return directory / REPORT

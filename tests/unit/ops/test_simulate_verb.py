@@ -70,7 +70,8 @@ def test_a_simulation_that_flies_is_not_finished_by_a_report(tmp_path: Path) -> 
     process.send_signal(signal.SIGINT)
     assert process.wait(120) == 130
     assert json.loads((folder / "summary.json").read_text())["outcome"] == "interrupted"
-    assert not (folder / "outcome.json").exists()
+    kept = json.loads((folder / "outcome.json").read_text())
+    assert (kept["outcome"], kept["mode"]) == ("interrupted", "lockstep")
 
 
 def test_ctrl_c_while_files_are_packed_is_too_late(tmp_path: Path) -> None:

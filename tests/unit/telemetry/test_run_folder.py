@@ -356,7 +356,35 @@ def test_how_a_run_ended_is_known_once_there_is_room(
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["outcome"], summary["mode"]) == (outcome.outcome, "lockstep")
     assert summary["violations"][:1] == list(problems[:1])
-    assert not (tmp_path / OUTCOME).exists()
+
+
+@pytest.mark.parametrize(
+    "outcome",
+    [
+        Outcome(outcome="completed", speed_factor=12.5),
+        Outcome(outcome="interrupted"),
+        Outcome(outcome="failed", problems=("agent-1 failed: battery",)),
+    ],
+)
+def test_a_run_whose_summary_is_removed_is_judged_as_it_was(tmp_path: Path, outcome: Outcome) -> None:
+    """It was judged as a failed flight in real time that its launcher did not finish, whatever it had been."""
+    write_config(tmp_path, "", "lockstep")
+    write_run(tmp_path, 3, 20.0)
+    for path in tmp_path.glob("agent-*.ticks"):
+        rows = np.fromfile(path, TICK_DTYPE)
+        rows["phase"][-1] = Phase.DONE
+        path.write_bytes(rows.tobytes())
+    finish_run(tmp_path, replace(RULES, mode="lockstep"), outcome)
+    judged = json.loads((tmp_path / "summary.json").read_text())
+    for _ in range(2):
+        (tmp_path / "summary.json").write_text("{")
+        with pytest.raises(ConfigError, match="Remove it, and the run is judged again"):
+            report_run(tmp_path, RULES)
+        (tmp_path / "summary.json").unlink()
+        report_run(tmp_path, RULES)
+        again = json.loads((tmp_path / "summary.json").read_text())
+        assert (again["outcome"], again["mode"]) == (outcome.outcome, "lockstep")
+        assert again == judged
 
 
 def test_a_completed_run_whose_recording_ends_in_flight_is_not_judged_to_its_end(tmp_path: Path) -> None:
@@ -365,7 +393,12 @@ def test_a_completed_run_whose_recording_ends_in_flight_is_not_judged_to_its_end
     (tmp_path / OUTCOME).write_text('{"outcome": "completed", "problems": []}')
     report_run(tmp_path, RULES)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert "the recording of agent 0 ends in LAND: the rest of its flight can't be judged" in summary["violations"]
+    ends = "the recording of agent 0 ends in LAND: the rest of its flight can't be judged"
+    assert summary["violations"].count(ends) == 1
+    (tmp_path / "summary.json").unlink()
+    report_run(tmp_path, RULES)
+    again = json.loads((tmp_path / "summary.json").read_text())
+    assert again["violations"] == summary["violations"], "said once, however often it is judged"
 
 
 @pytest.mark.parametrize(("agents", "seconds"), [(3, 60.0), (12, 40.0), (1, 3.5)])
