@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from swarmctl.core.recorded.records import NO_POINTS
 from swarmctl.core.types import Array
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replaced_by_program
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.recording.file_names import RECORDING
@@ -23,6 +23,7 @@ from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 APPLICATION = "swarmctl"
 _MIN_RECORDING_BYTES = 4096  # a smaller packed recording contains no entity and is rejected
+_BEGIN = b"RRF"  # of every recording; the number of its format follows
 _PLAN_PERIOD_US = 100_000  # of the predicted paths that are drawn
 _CHUNK_TICKS = 50  # ticks of an agent sent at once: one second
 _VIEWER_PORT_OPTIONS = ("--bind", "127.0.0.1", "--port", "auto")  # the default port would loop data back to our server
@@ -55,14 +56,14 @@ def open_viewer(target: str, log: Path | None = None) -> subprocess.Popen[bytes]
         log: file for the viewer's output; None to discard it.
 
     Raises:
+        ConfigError: the file is no recording.
         StartError: there is no display or no such recording, or the viewer can't be started.
     """
     if not has_display():
         raise StartError(
             f"no display: neither DISPLAY nor WAYLAND_DISPLAY is set. On a machine with one: rerun --port auto {target}"
         )
-    if "://" not in target and not Path(target).is_file():
-        raise StartError(f"{target}: no such recording")
+    refuse_no_recording(target)
     command = [str(viewer_binary()), target, "--memory-limit", _WINDOW_MEMORY, *_VIEWER_PORT_OPTIONS]
     try:
         with (log or Path(os.devnull)).open("ab") as output:
@@ -71,6 +72,26 @@ def open_viewer(target: str, log: Path | None = None) -> subprocess.Popen[bytes]
             )
     except OSError as error:
         raise StartError(f"the viewer can't be started: {error}") from error
+
+
+def refuse_no_recording(target: str) -> None:
+    """Check that a target is a live URL, or a file that begins as a recording does: rerun shows nothing of any other.
+
+    Raises:
+        ConfigError: it is a file with something else in it.
+        StartError: it does not exist, or can't be read.
+    """
+    if "://" in target:
+        return
+    if not Path(target).is_file():
+        raise StartError(f"{target}: no such recording")
+    try:
+        with Path(target).open("rb") as file:
+            begin = file.read(len(_BEGIN))
+    except OSError as error:
+        raise StartError(f"{target}: can't be read: {error.strerror or error}") from error
+    if begin != _BEGIN:
+        raise ConfigError(target, ["is no recording of rerun" if begin else "is empty: nothing was recorded"])
 
 
 def optimize_recording(directory: Path, timeout_s: float = 60.0) -> bool:

@@ -20,7 +20,7 @@ import psutil
 
 from swarmctl.errors import StartError
 from swarmctl.process_lifetime import PARENT_ENV, die_with_parent, module_command
-from swarmctl.telemetry.view.recordings import viewer_binary
+from swarmctl.telemetry.view.recordings import refuse_no_recording, viewer_binary
 from swarmctl.telemetry.view.view_ports import HOST, free_view_ports
 
 _FIRST_PAGE_PORT, _FIRST_DATA_PORT = 9090, 9976  # the live view has 9876 and those above it
@@ -43,11 +43,11 @@ def web_page(target: str, log: Path | None = None) -> Iterator[WebPage]:
         log: file for the server's output; None to discard it.
 
     Raises:
+        ConfigError: the file is no recording.
         StartError: there is no such recording, or no port is free, or the server does not start.
     """
     is_live = "://" in target
-    if not is_live and not Path(target).is_file():
-        raise StartError(f"{target}: no such recording")
+    refuse_no_recording(target)
     port, data_port = next(free_view_ports(_FIRST_PAGE_PORT), 0), next(free_view_ports(_FIRST_DATA_PORT), 0)
     if not port or not data_port:
         raise StartError(f"no free port from {_FIRST_PAGE_PORT} or {_FIRST_DATA_PORT} on for a page on {HOST}")

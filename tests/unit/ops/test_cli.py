@@ -275,6 +275,27 @@ def test_bad_usage_is_2(run: Run, capsys: pytest.CaptureFixture[str], arguments:
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("content", "said"), [(b"garbage\n", "is no recording of rerun"), (b"", "is empty: nothing was recorded")]
+)
+@pytest.mark.parametrize("shown", ["--web", "window"])
+def test_what_is_no_recording_is_not_shown(
+    run: Run,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    shown: str,
+    content: bytes,
+    said: str,
+) -> None:
+    """Its page was served, with nothing on it."""
+    (tmp_path / "telemetry.rrd").write_bytes(content)
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("it was given to rerun"))
+    assert run("replay", str(tmp_path), *(["--web"] if shown == "--web" else [])) == 2
+    assert capsys.readouterr().err == f"{tmp_path}/telemetry.rrd: {said}\n"
+
+
 def test_what_decides_again_serves_no_page(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("replay", "run", "--decide", "--web") == 2
     assert "--web" in capsys.readouterr().err, "it was ignored"
