@@ -224,6 +224,50 @@ def test_arducopter_is_flown_in_its_own_dialect_until_a_pilot_chooses_another_mo
     assert (flight.agent.finished, flight.agent.outcome) == (True, "completed")
 
 
+def given_back_and_never_obeyed() -> tuple[Watched, list[int]]:
+    """A flight whose autopilot hears no request for another mode since `resume`, and when these were sent."""
+    flight = Watched(*COPTER).until_mission(4.0)
+    loiter = mavlink.MAVLink_command_long_message(1, 1, 176, 0, 1.0, 5.0, 0, 0, 0, 0, 0)
+    link, reader, asked_us = flight.run.links[0][0], Codec(255, 190), list[int]()
+    PipeTransport.send(link, reader.encode(loiter))
+    flight.step_for(0.5)
+
+    def send(data: bytes) -> None:
+        for frame in frames(data):
+            message = reader.decode(frame)
+            flight.setpoints_us += [flight.now_us] if message_id(frame) == SETPOINT else []
+            if message is not None and message.get_type() == "COMMAND_LONG" and message.command == loiter.command:
+                asked_us.append(flight.now_us)
+            else:
+                PipeTransport.send(link, frame)
+
+    link.send = send  # type: ignore[method-assign]
+    flight.run.command("resume")
+    flight.step_for(3.0)
+    flight.run.command("rtl")
+    flight.step_for(42.0)
+    return flight, asked_us
+
+
+def test_an_autopilot_that_never_follows_again_keeps_the_vehicle_until_another_resume() -> None:
+    flight, asked_us = given_back_and_never_obeyed()
+    assert 28e6 < asked_us[-1] - asked_us[0] < 31e6
+    assert flight.setpoints_us[-1] - asked_us[-1] < 2_000_000, "PX4 would follow setpoints without being asked"
+    assert flight.agent.outcome == "no control 30 s after resume: it stays in HOLD"
+    del flight.run.links[0][0].send  # now it hears them
+    flight.run.command("resume")
+    flight.step_for(40.0)
+    assert (flight.agent.finished, flight.agent.outcome) == (True, "stopped by the operator")
+    assert np.linalg.norm(flight.run.world.truth_rows()[0]["pos_ned_m"][:2]) < 0.3, "flown home, as was ordered"
+
+
+def test_negative_control_without_an_end_it_is_asked_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MissionState, "asks_in_vain", lambda *_: False)
+    flight, asked_us = given_back_and_never_obeyed()
+    assert asked_us[-1] - asked_us[0] > 42e6
+    assert flight.setpoints_us[-1] - asked_us[0] > 42e6
+
+
 def without_attitudes() -> tuple[Watched, int]:
     """A flight whose vehicle has stopped to send its attitude 1.5 s ago, and when it did."""
     flight = Watched(*COPTER).until_mission(4.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from swarmctl.control.phases.inputs import PhaseInputs
-from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
+from swarmctl.control.phases.mission_state import ASKS_US, TAKEN_OVER, MissionState
 from swarmctl.core.types import Command, FlightMode, Mode, Phase, VehicleState, Verb
 
 # How long a vehicle without positions is in another mode, or disarmed, before that counts as a takeover: it may be a
@@ -31,7 +31,14 @@ def request_control(mission: MissionState, inputs: PhaseInputs, state: VehicleSt
     """Request control from the autopilot's own hold; from any other mode only after an operator's `resume`.
 
     No setpoints may be sent meanwhile: PX4 returns to OFFBOARD by itself when they reappear after a failsafe.
+
+    An autopilot that does not give it for too long keeps the vehicle until another `resume`.
     """
+    if mission.asks_in_vain(inputs.now_us):
+        mission.override(
+            f"no control {ASKS_US // 1_000_000} s after resume: it stays in {state.mode.name}", inputs.now_us
+        )
+        return []
     if not mission.may_take_control and is_under_other_control(state):
         leave_control(mission, inputs)
         return []

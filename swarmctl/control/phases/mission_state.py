@@ -29,6 +29,7 @@ REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
 PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
 COMPLETED = "completed"  # the outcome of a mission that was flown to its end
 _TAKES_BACK_US = 5_000_000  # from an operator's resume, for which the autopilot may take to follow setpoints again
+ASKS_US = 30_000_000  # from the same, for which the autopilot is asked to; later nobody would expect that it does
 TAKEN_OVER = "pilot or autopilot took over"
 
 
@@ -70,7 +71,7 @@ class MissionState:
         offered: the mission that the order `mission` has flown.
         stop_verb: land or rtl, from the command until the stop begins.
         may_take_control: an operator's resume permits taking control from any mode.
-        resumed_us: monotonic time of that resume.
+        resumed_us: monotonic time of that resume, or of one that has ended a hold since.
         setpoints_stopped: the override has followed from that.
         airborne: the vehicle was found in the air at start-up.
         landing_seen: the autopilot lands, or has.
@@ -219,6 +220,10 @@ class MissionState:
     def takes_back(self, now_us: int) -> bool:
         """Return whether the agent is taking the vehicle back, after an operator's resume, and does not have it yet."""
         return self.may_take_control and not self.had_control and now_us - self.resumed_us < _TAKES_BACK_US
+
+    def asks_in_vain(self, now_us: int) -> bool:
+        """Return whether the autopilot gives no control, which it was asked for since a resume for as long as it is."""
+        return self.may_take_control and not self.had_control and now_us - self.resumed_us >= ASKS_US
 
     def is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Return whether the vehicle is on the ground and known to be disarmed."""

@@ -97,6 +97,7 @@ def _change_mission(mission: MissionState, order: Order, now_us: int, utc_us: in
 
 def _resume(mission: MissionState, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
     if mission.held:
+        mission.resumed_us = now_us
         _release(mission, now_us, state)
         if not mission.interruptions.paused:
             mission.go_on(now_us, utc_us, state)

@@ -243,3 +243,46 @@ def test_a_landing_that_can_not_be_had_back_is_landed_all_the_same() -> None:
     assert flight.ask("resume") == ""
     assert set(flight.run(4.5)) == {Verb.EXTERNAL}
     assert Verb.LAND in flight.run(10.0)
+
+
+@pytest.mark.parametrize("mode", [FlightMode.HOLD, FlightMode.MANUAL, FlightMode.RTL])
+@pytest.mark.parametrize(("phase", "order"), [(Phase.TRACK, "rtl"), (Phase.TRACK, ""), (Phase.GOTO_LAND, "")])
+def test_an_autopilot_that_gives_no_control_is_asked_for_half_a_minute_and_keeps_the_vehicle(
+    phase: Phase, order: str, mode: FlightMode
+) -> None:
+    """It was asked for ever: long after, when nobody expects it any more, it might have set off."""
+    flight = away(phase, 5.0)
+    flight.flight_mode = mode
+    if order:
+        assert flight.ask(order) == ""
+    asked = flight.run(300.0)
+    assert asked == [Verb.EXTERNAL] * 30
+    assert flight.mission.pilot_override
+    assert flight.mission.outcome == f"no control 30 s after resume: it stays in {mode.name}"
+    assert "take it back with: resume" in flight.ask("rtl")
+    assert flight.ask("resume") == ""
+    assert flight.run(2.0) == [Verb.EXTERNAL] * 2, "another resume asks again"
+    flight.flight_mode, flight.failsafe_mode = FlightMode.EXTERNAL, Mode.TRACKING
+    flight.run(0.5)
+    assert flight.mission.had_control
+    if order:
+        flight.pos = START.copy()
+        assert flight.run(5.0)[:1] == [Verb.LAND], "it goes on with the order"
+
+
+def test_a_hold_that_ends_begins_to_ask_anew() -> None:
+    flight = away(Phase.GOTO_LAND, 5.0)
+    assert flight.ask("hold") == ""
+    assert flight.run(60.0) == []
+    assert flight.ask("resume") == ""
+    assert flight.run(2.0) == [Verb.EXTERNAL] * 2
+    assert not flight.mission.pilot_override
+
+
+def test_who_has_control_keeps_it_however_long_ago_it_was_given_back() -> None:
+    flight = away(Phase.GOTO_LAND, 5.0)
+    flight.run(29.0)
+    flight.flight_mode, flight.failsafe_mode = FlightMode.EXTERNAL, Mode.TRACKING
+    flight.run(10.0)
+    assert flight.mission.had_control
+    assert not flight.mission.pilot_override
