@@ -27,6 +27,7 @@ from swarmctl.core.types import Array, Command, ControlMode, Landed, Mode, Phase
 
 REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
 PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
+_FLIES_BACK = ": flies back"  # of an outcome, until it is known whether the vehicle has
 COMPLETED = "completed"  # the outcome of a mission that was flown to its end
 _TAKES_BACK_US = 5_000_000  # from an operator's resume, for which the autopilot may take to follow setpoints again
 ASKS_US = 30_000_000  # from the same, for which the autopilot is asked to; later nobody would expect that it does
@@ -236,6 +237,7 @@ class MissionState:
         self.phase = phase
         if phase >= Phase.LAND:
             self.interruptions.end_hold()
+            self.end_way_back("did not get back")
         self.requested_us = now_us - SPIN_UP_US
 
     def may_request(self, inputs: PhaseInputs, every_us: int = REQUEST_PERIOD_US) -> bool:
@@ -285,6 +287,16 @@ class MissionState:
         self._begin_landing(now_us)
         if self.interruptions.paused:
             self.interruptions.stay(now_us, state)
+
+    def fly_back(self, why: str, now_us: int, state: VehicleState) -> None:
+        """Fly to the landing place because something ends the mission."""
+        self.outcome = self.outcome or f"{why}{_FLIES_BACK}"
+        self.go_home(now_us, state)
+
+    def end_way_back(self, words: str) -> None:
+        """Have the outcome say what has become of a vehicle that flies back."""
+        if self.outcome.endswith(_FLIES_BACK):
+            self.outcome = f"{self.outcome.removesuffix(_FLIES_BACK)}: {words}"
 
     def stop_in_place(self, now_us: int, state: VehicleState) -> None:
         """Brake and move away from others under the own plan, then let the autopilot land there."""

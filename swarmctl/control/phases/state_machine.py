@@ -171,8 +171,7 @@ class MissionStateMachine:
         if mission.had_control and inputs.mode not in PLAN_MODES:
             return
         if response is Response.RTL and mission.may_fly_on and mission.had_control:
-            mission.outcome = mission.outcome or f"{why}: flew back"
-            mission.go_home(inputs.now_us, state)
+            mission.fly_back(why, inputs.now_us, state)
         elif (response >= Response.RTL and mission.may_fly_on) or (response is Response.LAND and flies_home):
             mission.give_up(why, inputs, state)
             mission.land_by_us = min(mission.land_by_us, inputs.now_us + inputs.escalation.patience_us)

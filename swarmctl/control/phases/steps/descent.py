@@ -32,6 +32,8 @@ def goto_land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -
         return handover.request_control(mission, inputs, state)
     if landing.is_reached(inputs, state, controls=controls, paused=mission.interruptions.paused):
         if inputs.now_us > mission.land_by_us or not (controls and _is_crossed(mission, inputs, state)):
+            if not landing.in_place:
+                mission.end_way_back("flew back")
             mission.enter(Phase.LAND, inputs.now_us)
     elif inputs.now_us > mission.land_by_us:
         if landing.is_possible_here(inputs, state, controls=controls) or inputs.mode not in PLAN_MODES:
