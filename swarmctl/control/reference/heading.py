@@ -29,9 +29,9 @@ class Heading:
 
         Args:
             now_us: monotonic time.
-            asked_yaw_rad: heading to turn to; None: the present one.
+            asked_yaw_rad: heading to turn to; None, or what is no finite number: the present one.
         """
-        goal_rad = self._yaw_rad if asked_yaw_rad is None else asked_yaw_rad
+        goal_rad = self._yaw_rad if asked_yaw_rad is None or not math.isfinite(asked_yaw_rad) else asked_yaw_rad
         passed_s = 0.0 if self._then_us is None else (now_us - self._then_us) * 1e-6
         self._then_us = now_us
         step_rad = _RATE_RAD_S * min(passed_s, 0.1)  # after a gap the vehicle has not turned meanwhile

@@ -49,3 +49,9 @@ def test_what_estimates_are_off_by_turns_nothing() -> None:
     heading = Heading(0.5)
     heading.begin(0.58)
     assert heading.at(0, None) == 0.5
+
+
+@pytest.mark.parametrize("asked_rad", [math.nan, math.inf, -math.inf])
+def test_what_is_no_heading_is_not_turned_to(asked_rad: float) -> None:
+    heading = Heading(0.5)
+    assert turn(heading, asked_rad, 1.0) == [0.5] * len(turn(Heading(0.5), 0.5, 1.0))
