@@ -12,6 +12,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.agent import assembly
 from swarmctl.bus.bus import agent_name
 from swarmctl.config import load
+from swarmctl.control.collision.barrier import Barrier
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.control.phases.trajectories import Trajectories
 from swarmctl.core.closest_pair import closest_pair_m
@@ -148,7 +149,7 @@ SIX = (
     "start.positions_ned_m=[[3,0,-2],[1.5,2.6,-2],[-1.5,2.6,-2],[-3,0,-2],[-1.5,-2.6,-2],[1.5,-2.6,-2]]",
     "mission.swap.travel_s=6",
 )
-SIX_CUT_S, SIX_DEADLOCKED_S = 2.4, 11.5
+SIX_CUT_S, SIX_DEADLOCKED_S, SIX_DRIVEN_S = 2.4, 11.5, 5.5
 
 
 def cut(running: Lockstep) -> None:
@@ -245,3 +246,24 @@ def test_who_rests_stays_where_it_has_been_driven_to() -> None:
 def test_negative_control_who_goes_back_to_where_it_stopped_meets_another(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Trajectories, "is_left", lambda *_: False)
     fly_now(*SIX, at={SIX_CUT_S: cut}, until=closer_than(0.3), seed=1)
+
+
+def driven_m(seed: int) -> float:
+    """Return how far one of six is driven outwards at most, from where it was nearest to the middle."""
+    flight = fly_now(*SIX, at={SIX_CUT_S: cut}, until=past(SIX_DRIVEN_S), seed=seed)
+    from_middle_m = np.linalg.norm(flight.pos_ned_m[:, :, :2], axis=2)
+    return float((from_middle_m[-1] - from_middle_m.min(axis=0)).max())
+
+
+@pytest.mark.parametrize("seed", [2, 6])
+def test_who_is_driven_from_others_does_not_fly_on_for_metres(seed: int) -> None:
+    assert driven_m(seed) < 2.1
+
+
+@pytest.mark.usefixtures("configured_starts")
+def test_negative_control_a_tilt_taken_back_at_once_leaves_an_attitude_that_lags(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Rotors that are saturated turn it only in part, and the thesis' loops take seconds for what is left."""
+    monkeypatch.setattr(Barrier, "eased", lambda _, wanted, __: wanted)
+    assert driven_m(6) > 4.0

@@ -57,12 +57,15 @@ class SafetyFilter:
     ) -> Array:
         """Return the virtual controls (3,) to fly from `act_utc_us` on; unchanged ones unless the agent `flies`.
 
+        After an encounter it acts on until the plan's controls are as near as attitudes follow.
+
         Peers in `committed_peers` are placed on the trajectories they have committed to, others on their paths.
         """
         began_ns, changed = self._stopwatch_ns(), None
         if self._params.enabled and flies:
+            wanted = self._barrier.eased(virtual_control, start) if self.acts else virtual_control
             changed = self._barrier.filtered(
-                virtual_control,
+                wanted,
                 start,
                 estimate.disturbance_ned_m_s2,
                 estimate.hover_thrust_01,
@@ -74,6 +77,8 @@ class SafetyFilter:
                     committed_peers=committed_peers,
                 ),
             )
+            if changed is None and wanted is not virtual_control:
+                changed = wanted
         self._count(now_us, changed is not None)
         self.duration_ms = (self._stopwatch_ns() - began_ns) * 1e-6
         return virtual_control if changed is None else changed

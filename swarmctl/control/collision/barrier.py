@@ -187,6 +187,19 @@ class Barrier:
         flown = [min(most, max(least, f / size)) for f, (least, most) in zip(thrust_vector, slew_bounds, strict=False)]
         return np.array([*flown, size])
 
+    def eased(self, virtual_control: Array, start: Start) -> Array:
+        """Return the controls (3,) on the way from those held now to these; the same array where they are near enough.
+
+        What this filter commands may be far beyond what a controller may ask for. Taken back in one command, it
+        saturates rotors as much as an attitude that comes at once.
+        """
+        ux, uy, thrust = virtual_control.tolist()
+        if not (math.isfinite(ux) and math.isfinite(uy)):
+            return virtual_control  # for others to refuse
+        spans = ((held - self._slew, held + self._slew) for held in start.virtual_control.tolist()[:2])
+        near = [min(most, max(least, u)) for u, (least, most) in zip((ux, uy), spans, strict=True)]
+        return virtual_control if near == [ux, uy] else np.array([*near, thrust])
+
     def _nearest(
         self,
         wanted: Vector,
