@@ -6,7 +6,10 @@ Setpoints are sent from the tick only. If this loop stalls they stop, and the au
 from __future__ import annotations
 
 import gc
+import os
+import re
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -48,6 +51,7 @@ from swarmctl.telemetry.recording.shared_events import SharedEvents
 from swarmctl.wall_clock import WallClock
 
 _LOOPBACK = "127.0.0.1"
+_RUN, _RUN_IN_WORDS = re.compile(r"^[^/*$#?\s]+$"), "without spaces and / * $ # ?, which keys of the bus are made of"
 _LINGER_S = 1.0  # time the process lives on after its end, so that peers receive the last status
 _STOP_REPEAT_US = 1_000_000
 NOTHING_REFUSED: Mapping[str, int] = MappingProxyType({})
@@ -127,7 +131,7 @@ def run_agent(process: AgentProcess) -> int:
 
     Raises:
         StartError: link, bus or vehicle can't be reached.
-        ConfigError: the configuration is not valid, has no such agent, or the bus is no endpoint.
+        ConfigError: the configuration is not valid, has no such agent, or what the process is given can't be used.
     """
     stop = StopRequest(signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     clock = WallClock()
@@ -169,14 +173,13 @@ def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> 
 
     Raises:
         StartError: link, bus or vehicle can't be reached.
-        ConfigError: the configuration is not valid, has no such agent, or the bus is no endpoint.
+        ConfigError: the configuration is not valid, has no such agent, or what the process is given can't be used.
     """
     agent = process.agent
     config = load(process.config_path, only_agents=(agent,))
     if not 0 <= agent < config.swarm.agents:
         raise ConfigError(f"--id {agent}", [f"allowed: 0..{config.swarm.agents - 1} (swarm.agents)"])
-    if process.bus != NO_BUS:
-        socket_file(process.bus)
+    _refuse_unusable(process)
     if process.only_land:
         stop.ask()
     key = read_own_key(config.mavlink.signing_keys, agent)
@@ -215,6 +218,30 @@ def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> 
         finally:
             for name, fields in flown.totals(recorder.lost).items():
                 note(name, **fields)
+
+
+def _refuse_unusable(process: AgentProcess) -> None:
+    """Check what a command line names, before anything is opened.
+
+    Raises:
+        ConfigError: bus, run, folder or socket is none.
+    """
+    if process.bus != NO_BUS:
+        socket_file(process.bus)
+    if not _RUN.match(process.run):
+        raise ConfigError(f"--run {process.run!r}", [f"is no name of a run on the bus: {_RUN_IN_WORDS}"])
+    if not process.run_dir.is_dir():  # nothing would be recorded
+        raise ConfigError(f"--run-dir {process.run_dir}", ["no such folder; make it first"])
+    if process.fd is not None and not _is_udp(process.fd):
+        raise ConfigError(f"--fd {process.fd}", ["is no UDP socket that this process has inherited"])
+
+
+def _is_udp(fd: int) -> bool:
+    try:
+        with socket.socket(fileno=os.dup(fd)) as sock:
+            return sock.type == socket.SOCK_DGRAM
+    except OSError:
+        return False
 
 
 def _vehicle_in_words(config: Config, agent: int) -> str:

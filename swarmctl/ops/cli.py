@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from swarmctl import __version__
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError, exit_code_of
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, StartError, SwarmError, exit_code_of
 from swarmctl.ops.verbs.agent import add_agent_verb
 from swarmctl.ops.verbs.configuration import config_app
 from swarmctl.ops.verbs.folders import Web, add_folder_verbs, show_in_browser
@@ -59,6 +59,7 @@ WebPage = Annotated[
     bool, typer.Option("--web", help="Serve the view to browsers of this computer; no window, unless --view.")
 ]
 _WATCH_S = 0.25
+_MOST_VEHICLES = 100
 # The verb's module declares the options, and answers --help.
 _PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
@@ -258,9 +259,14 @@ def fault(
     from swarmctl.ops import running_launches
     from swarmctl.ops.orders import fault as faults
 
-    launch = running_launches.find_launch(run)
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
-    asked = faults.parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
+    wanted |= {"direction": direction, "towards_deg": towards}
+    try:
+        launch = running_launches.find_launch(run)
+    except StartError:
+        faults.parse_fault(wanted, _MOST_VEHICLES)  # whose kinds are listed without a launch, too
+        raise
+    asked = faults.parse_fault(wanted, launch.agents)
     since_boot_s = faults.inject(launch, asked)
     if as_json:
         print(faults.as_json(launch.run, asked, since_boot_s))

@@ -96,9 +96,10 @@ def rewrite_report(directory: Path) -> Path:
         ConfigError: it is no run folder.
         StartError: the run is not over yet.
     """
-    from swarmctl.telemetry.recording.run_files import read_summary  # heavy
+    from swarmctl.telemetry.recording.run_files import read_summary, refuse_no_folder  # heavy
     from swarmctl.telemetry.recording.run_folder import report_run
 
+    refuse_no_folder(directory)
     if read_summary(directory) is None and launch_in(directory) is not None:
         raise StartError(f"{directory}: its launch still flies or is ending, see: swarmctl status")
     return report_run(directory, load_recorded(directory).rules())

@@ -54,6 +54,8 @@ def check(config: Config, options: CheckOptions) -> int:
     """
     if options.json is not None and not options.json.parent.is_dir():  # told before every vehicle is asked
         raise StartError(f"{options.json}: {options.json.parent} is no folder. Choose another with --json")
+    if options.json is not None and options.json.is_dir():
+        raise StartError(f"{options.json}: can't be written: it is a folder. Choose another with --json")
     for line in warning_lines(config):
         print(line, file=sys.stderr)
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)  # so that started processes are ended

@@ -106,6 +106,8 @@ def refuse_no_folder(directory: Path) -> None:
     Raises:
         ConfigError: it does not.
     """
+    if directory.exists() and not directory.is_dir():
+        raise ConfigError(str(directory), ["is a file. Give the run folder that it is in"])
     if not directory.is_dir():
         raise ConfigError(str(directory), ["no such run folder. Give one that launch or simulate wrote"])
 

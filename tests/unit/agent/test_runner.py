@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from pathlib import Path
@@ -11,7 +12,16 @@ from typing import Any
 
 import pytest
 
-from swarmctl.agent.runner import NOTHING_REFUSED, Pace, RealTimeAgent, StopOrder, _check_vehicle_silence, _fly
+from swarmctl.agent.runner import (
+    NOTHING_REFUSED,
+    AgentProcess,
+    Pace,
+    RealTimeAgent,
+    StopOrder,
+    _check_vehicle_silence,
+    _fly,
+    run_agent,
+)
 from swarmctl.bus.silence import SessionWatch
 from swarmctl.config import load
 from swarmctl.core.clock import SimClock
@@ -132,23 +142,27 @@ def test_each_session_that_was_replaced_is_recorded_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("agent", "bus", "said"),
+    ("given", "said"),
     [
-        (2, "none", r"--id 2: allowed: 0\.\.1"),
-        (-1, "none", r"--id -1: allowed: 0\.\.1"),
-        *((0, bus, "use unixsock-stream//ABSOLUTE/PATH") for bus in ("tcp/127.0.0.1:1", "", "unixsock-stream/here")),
+        ({"agent": 2}, r"--id 2: allowed: 0\.\.1"),
+        ({"agent": -1}, r"--id -1: allowed: 0\.\.1"),
+        *(({"bus": bus}, "use unixsock-stream//ABSOLUTE/PATH") for bus in ("tcp/127.0.0.1:1", "", "unixsock-stream/x")),
+        *(({"run": run}, rf"--run '{re.escape(run)}': is no name of a run") for run in ("", "a/b", "a b", "*", "a$")),
+        ({"run_dir": Path("nowhere")}, "--run-dir nowhere: no such folder; make it first"),
+        ({"fd": 987}, "--fd 987: is no UDP socket that this process has inherited"),
+        ({"fd": 0}, "--fd 0: is no UDP socket that this process has inherited"),
     ],
+    ids=str,
 )
-def test_an_agent_or_a_bus_that_there_cannot_be_is_bad_usage_and_refused_before_anything_is_opened(
-    tmp_path: Path, agent: int, bus: str, said: str
+def test_what_an_agent_is_given_is_bad_usage_where_there_is_no_such_thing_and_nothing_is_opened(
+    tmp_path: Path, given: dict[str, Any], said: str
 ) -> None:
-    from swarmctl.agent.runner import AgentProcess, run_agent
-
     path, run_dir = tmp_path / "config.toml", tmp_path / "run"
     path.write_text("[swarm]\nagents = 2\n", encoding="utf-8")
     run_dir.mkdir()
+    fine: dict[str, Any] = {"agent": 0, "run": "run", "bus": "none", "run_dir": run_dir}
     with pytest.raises(ConfigError, match=said):
-        run_agent(AgentProcess(config_path=path, agent=agent, run="run", bus=bus, run_dir=run_dir))
+        run_agent(AgentProcess(config_path=path, **{**fine, **given}))
     assert not list(run_dir.iterdir()), "a recorder was opened"
 
 

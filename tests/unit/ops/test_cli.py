@@ -29,6 +29,7 @@ from swarmctl.ops.orders import obstacle_list
 from swarmctl.ops.orders.order_delivery import Reply
 from swarmctl.ops.running_launches import RunningLaunch
 from swarmctl.ops.verbs import orders
+from swarmctl.simulator_config import FAULTS
 from swarmctl.wall_clock import WallClock
 
 Run = Callable[..., int]
@@ -294,6 +295,25 @@ def test_what_is_no_recording_is_not_shown(
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("it was given to rerun"))
     assert run("replay", str(tmp_path), *(["--web"] if shown == "--web" else [])) == 2
     assert capsys.readouterr().err == f"{tmp_path}/telemetry.rrd: {said}\n"
+
+
+@pytest.mark.parametrize("verb", [("report",), ("replay",), ("export", "--mcap"), ("bundle",), ("replay", "--decide")])
+def test_a_file_of_a_run_is_no_run_folder_and_which_is_is_said(
+    run: Run, capsys: pytest.CaptureFixture[str], tmp_path: Path, verb: tuple[str, ...]
+) -> None:
+    recording = tmp_path / "telemetry.rrd"
+    recording.touch()
+    assert run(*verb, str(recording)) == 2
+    assert capsys.readouterr().err == f"{recording}: is a file. Give the run folder that it is in\n"
+
+
+@pytest.mark.usefixtures("nobody")
+def test_kinds_of_faults_are_listed_without_a_launch_too(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("fault", "nonsense") == 2
+    said = capsys.readouterr().err
+    assert all(kind in said for kind in FAULTS)
+    assert run("fault", "gps_loss") == 3
+    assert "no launch runs" in capsys.readouterr().err
 
 
 def test_what_decides_again_serves_no_page(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
