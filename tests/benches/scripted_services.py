@@ -45,6 +45,7 @@ signal.signal(signal.SIGTERM, signal.SIG_IGN)
 print('up', flush=True)
 time.sleep(60)
 """
+LOADS_MODULES = "import time; print('up', flush=True); time.sleep(60)"  # SIGTERM ends it, as nothing handles it yet
 FLIES_LONG = LANDS_ON_SIGTERM + "time.sleep(60)"
 
 

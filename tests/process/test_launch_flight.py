@@ -32,7 +32,7 @@ from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
 from swarmctl.telemetry.recording.run_files import read_events
-from tests.benches.scripted_services import FLIES_LONG, IGNORES_SIGTERM, ScriptedServices, ends
+from tests.benches.scripted_services import FLIES_LONG, IGNORES_SIGTERM, LOADS_MODULES, ScriptedServices, ends
 
 pytestmark = pytest.mark.process
 
@@ -241,6 +241,32 @@ def test_an_agent_that_crashes_before_its_first_status_did_not_start(tmp_path: P
     scene = ScriptedServices(tmp_path, [ends(1)])
     scene.silent.add(0)
     assert scene.fly().exit_code(violated=False) == EXIT_START
+
+
+def test_agents_that_an_interrupt_ends_while_they_load_have_not_failed_to_start(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [LOADS_MODULES, LOADS_MODULES])
+    scene.silent |= {0, 1}
+    scene.began_s, scene.act = 0.0, lambda: setattr(scene, "interrupts", 1)
+    result = scene.fly()
+    assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [143, 143]
+    assert (result.outcome, result.problems) == ("interrupted", [])
+
+
+def test_only_the_agent_that_can_not_start_is_blamed_where_others_still_load(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [LOADS_MODULES, ends(3)])
+    scene.silent |= {0, 1}
+    result = scene.fly()
+    assert result.problems == ["agent-1 could not start: because"]
+    assert result.exit_code(violated=False) == EXIT_START
+
+
+def test_an_agent_that_somebody_ends_before_its_first_status_did_not_start(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [LOADS_MODULES])
+    scene.silent.add(0)
+    scene.began_s, scene.act = 0.0, lambda: scene.children["agent-0"].signal(signal.SIGTERM)
+    result = scene.fly()
+    assert result.problems == ["agent-0 could not start: it was killed by SIGTERM"]
+    assert result.exit_code(violated=False) == EXIT_START
 
 
 def test_first_interrupt_lands_all_agents(tmp_path: Path) -> None:

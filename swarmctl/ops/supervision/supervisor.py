@@ -50,6 +50,7 @@ _LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
 _ROUTER_STARTS = 3  # in one flight
 _TOLD_S = 0.3  # in which the router passes on what it was told last
+_ENDED_BY_SIGTERM = 128 + signal.SIGTERM  # exit code
 _AFTER_DEATH_S = 3.0  # the simulator must outlive a dead agent until its vehicle has landed
 
 
@@ -353,7 +354,8 @@ class FlightSupervisor:
             outcome = view.status.outcome if view.status else ""
             self._fail("agent_failed", f"{child.name} failed: {why_it_failed(outcome, child.last_line())}")
         elif view.status is None:
-            self._refuse(f"{child.name} could not start: it {child.how_it_ended()}")
+            if self._land_ordered_s is None or code != _ENDED_BY_SIGTERM:  # `_land` ends so who still loads its modules
+                self._refuse(f"{child.name} could not start: it {child.how_it_ended()}")
         else:
             view.note = "dead"
             others = "; the others fly on" if self._running() else ""
