@@ -60,6 +60,8 @@ def replay(
     if sets or as_json:
         raise ConfigError("replay", ["--set and --json are for --decide"])
     refuse_no_folder(folder)
+    if not (folder / RECORDING).is_file():
+        raise ConfigError(str(folder), [f"holds no {RECORDING}: it is no run, or telemetry.enabled was false"])
     if web:
         return show_in_browser(str(folder / RECORDING))
     open_viewer(str(folder / RECORDING))

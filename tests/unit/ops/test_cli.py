@@ -316,6 +316,15 @@ def test_kinds_of_faults_are_listed_without_a_launch_too(run: Run, capsys: pytes
     assert "no launch runs" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("options", [(), ("--web",)])
+def test_a_folder_without_a_recording_is_bad_usage_with_and_without_a_display(
+    run: Run, capsys: pytest.CaptureFixture[str], tmp_path: Path, options: tuple[str, ...]
+) -> None:
+    """It was told to open a file, which is not there, on a computer with a display."""
+    assert run("replay", str(tmp_path), *options) == 2
+    assert "holds no telemetry.rrd" in capsys.readouterr().err
+
+
 def test_what_decides_again_serves_no_page(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("replay", "run", "--decide", "--web") == 2
     assert "--web" in capsys.readouterr().err, "it was ignored"
