@@ -25,14 +25,20 @@ from swarmctl.control.reference.mission import GROUP as MISSIONS_OFFERED
 from swarmctl.core.operator_verbs import OPERATOR_VERBS
 from swarmctl.core.recorded.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Phase
+from swarmctl.ops.running_launches import LAUNCH_FILE
 from swarmctl.ops.supervision.supervisor import ESSENTIAL_ENDED
-from swarmctl.telemetry.recording.file_names import RECORDING
+from swarmctl.telemetry.recording.file_names import CONFIG, EVENTS, OUTCOME, PACKED_TRUTH, RECORDING, SUMMARY
+from swarmctl.telemetry.recording.run_files import read_summary
+from swarmctl.telemetry.view.viewer import URL_FILE
+from tests.benches.recorded_runs import write_configured_run
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 QUOTED = re.compile(r"`([^`\s]+)`")
 PACKAGES = "|".join(path.parent.name for path in (ROOT / "swarmctl").glob("*/__init__.py"))
 IN_PACKAGE = re.compile(rf"({PACKAGES})(\.[a-z]\w*)+")  # a module by its name within the bridge
+TELLS = ("note", "say", "fail", "announce", "event", "tell", "write")  # that tell of an event, by what it is called
+NAMES_INSIDE = ("sent", "sent_by", "rejected", "refused_frames")  # of a summary
 FOLDERS = ("swarmctl/", "sitl/", "tests/", "tools/", "configs/", "docs/")
 _HAS_STATEMENTS = ast.stmt, ast.ExceptHandler, ast.match_case  # expressions, most of a tree, have no docstrings
 PLUG_INS = {"swarmctl/control/controllers/", "swarmctl/control/reference/kinds/", "swarmctl/mavlink/dialects/"}
@@ -67,6 +73,59 @@ def test_every_event_is_described() -> None:
     events = {event for call in calls for event in re.findall(call, code)}
     assert len(events) > 55
     assert (events | set(ESSENTIAL_ENDED.values())) - described() == set()
+
+
+def test_every_field_of_an_event_is_described_in_its_row() -> None:
+    rows = {event: set(QUOTED.findall(told)) for names, told in event_rows() for event in QUOTED.findall(names)}
+    fields = {(event, field) for event, field in told_fields() if event in rows}
+    assert len(fields) > 80
+    assert {(event, field) for event, field in fields if field not in rows[event]} == set()
+
+
+def event_rows() -> list[tuple[str, str]]:
+    """Return both columns of the table of events."""
+    page = (ROOT / "docs" / "data_formats.md").read_text()
+    section = page.partition("\n## `events.jsonl`\n")[2].partition("\n## ")[0]
+    return re.findall(r"^\| (`.*?) \| (.*) \|$", section, re.MULTILINE)
+
+
+def told_fields() -> Iterator[tuple[str, str]]:
+    """Yield events and their fields, as they are written by name in calls that tell of one."""
+    for path in (ROOT / "swarmctl").rglob("*.py"):
+        for call in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)):
+            name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+            if name.strip("_") not in TELLS:
+                continue
+            events = [each.value for each in call.args[:3] if isinstance(each, ast.Constant)]
+            fields = [keyword.arg for keyword in call.keywords if keyword.arg not in (None, "t_us", "utc_us")]
+            yield from ((str(event), str(field)) for event in events[:1] for field in fields)
+
+
+def test_every_key_of_a_summary_is_described(tmp_path: Path) -> None:
+    write_configured_run(tmp_path, 2, 8.0)
+    page = (ROOT / "docs" / "data_formats.md").read_text()
+    section = page.partition("\n## `summary.json`\n")[2].partition("\n## ")[0]
+    described_keys = {key for name in QUOTED.findall(section) for key in re.split(r"\W+", name)}
+    keys = set(keys_within(read_summary(tmp_path)))
+    assert len(keys) > 45
+    assert keys - described_keys == set()
+
+
+def keys_within(value: object) -> Iterator[str]:
+    """Yield the keys of objects within a value, but for those that are names of topics, agents or reasons."""
+    if isinstance(value, list):
+        for item in value:
+            yield from keys_within(item)
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield key
+            names = () if key not in NAMES_INSIDE else item.values()
+            yield from (within for each in names for within in keys_within(each))
+            yield from () if key in NAMES_INSIDE else keys_within(item)
+
+
+def test_every_file_of_a_run_folder_is_described() -> None:
+    assert {RECORDING, SUMMARY, EVENTS, OUTCOME, CONFIG, PACKED_TRUTH, LAUNCH_FILE, URL_FILE} - described() == set()
 
 
 def test_the_height_of_the_simulated_ground_is_told_where_heights_are() -> None:
