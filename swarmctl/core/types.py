@@ -246,7 +246,6 @@ class Health:
     state_age_us: int
     armed: bool
     mode: FlightMode
-    landed: Landed
     autopilot_failsafe: bool
     plan_status: PlanStatus
     last_good_plan_age_us: int  # of the newest certified plan that is still safe

@@ -8,14 +8,13 @@ from typing import Any
 import pytest
 
 from swarmctl.control.failsafe.decision import FailsafeParams, decide
-from swarmctl.core.types import FlightMode, Health, Landed, Mode, Phase, PlanStatus
+from swarmctl.core.types import FlightMode, Health, Mode, Phase, PlanStatus
 
 PARAMS = FailsafeParams()  # state 0.2 s, replay 0.4 s, hold 5 s, rest 0.2 m/s
 GOOD = Health(
     state_age_us=20_000,
     armed=True,
     mode=FlightMode.EXTERNAL,
-    landed=Landed.IN_AIR,
     autopilot_failsafe=False,
     plan_status=PlanStatus.OK,
     last_good_plan_age_us=0,
