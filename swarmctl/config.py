@@ -22,6 +22,7 @@ from swarmctl.bus.messages.json_messages import MAX_OBSTACLES
 from swarmctl.bus.network.hosts import HostParams, host_problems, roster_of
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.configuration.constraints import (
+    address_problems,
     braking_problems,
     forward_problems,
     obstacle_problems,
@@ -238,7 +239,10 @@ def load(
     locate(tree, folder)
     locate_keys(tree, folder)
     locate_identities(tree, folder)
-    config = validated(Config, tree, source, _RENAMED)
+    try:
+        config = validated(Config, tree, source, _RENAMED)
+    except ConfigError as error:
+        raise ConfigError(source, [*error.problems, *address_problems(tree)]) from error
     make_importable(config.own_folder)
     problems = list(own_problems(config.mission, config.controller, config.vehicle_model, config.separation))
     problems = problems or [*_whole(config, only_agents), *_infeasible(config)]

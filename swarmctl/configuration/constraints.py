@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from swarmctl.agent.setup import AgentParams
 from swarmctl.agent.sharing.path_sharing import PathSharingParams
@@ -25,6 +26,7 @@ from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.transport import Endpoint, parse_url
 
 _PAIRS_SHOWN = 3
+_ANY_URL = "udpin://127.0.0.1:1"  # in place of one that is missing or no text, which is said elsewhere
 _SAME_TICK = 1e-3  # share by which two times between ticks may differ
 _HEARTBEATS = 4  # within the time after which a peer counts as silent: three may be missed in succession
 _LEAST_FAR_COMMITTED_HZ = 2.0  # a round trip, one message of it lost, lasts less than a lease
@@ -256,6 +258,20 @@ def forward_problems(urls: Sequence[str]) -> Iterator[str]:
                 raise ValueError(f"{url!r}: only udpout://HOST:PORT is forwarded to")
         except ValueError as error:
             yield f"mavlink.forward.{i} = {error}"
+
+
+def address_problems(tree: Mapping[str, Any]) -> Iterator[str]:
+    """Yield which addresses of a plain tree are none, whatever else is wrong with it."""
+    vehicles, mavlink = tree.get("vehicles"), tree.get("mavlink")
+    for i, vehicle in enumerate(vehicles if isinstance(vehicles, list) else ()):
+        url = vehicle.get("url") if isinstance(vehicle, dict) else None
+        try:
+            parse_url(url if isinstance(url, str) else _ANY_URL)
+        except ValueError as error:
+            yield f"vehicles.{i}.url = {error}"
+    urls = mavlink.get("forward") if isinstance(mavlink, dict) else None
+    if isinstance(urls, list) and all(isinstance(url, str) for url in urls):
+        yield from forward_problems(urls)
 
 
 def simulated_host_problems(hosts: Sequence[HostParams]) -> Iterator[str]:

@@ -255,6 +255,17 @@ def test_all_problems_at_once(tmp_path: Path) -> None:
         load(path)
 
 
+def test_addresses_that_are_none_are_said_with_all_other_problems(tmp_path: Path) -> None:
+    """They came to light one after the other: of the vehicles only when every key was right by itself."""
+    path = vehicles(tmp_path, "udq://127.0.0.1:1", "udpin://127.0.0.1:70000", b=300)
+    problems = refusals(path, "separation.radius_m=-1", 'mavlink.forward=["udpin://127.0.0.1:1"]')
+    keys = ("vehicles.0.url", "vehicles.1.url", "vehicles.1.sysid", "separation.radius_m", "mavlink.forward.0")
+    assert len(problems) == len(keys)
+    assert all(any(problem.startswith(f"{key} = ") for problem in problems) for key in keys)
+    assert "vehicles.0.url = 'udq://127.0.0.1:1': use udpin://HOST:PORT" in "\n".join(problems)
+    assert "vehicles.1.url = 'udpin://127.0.0.1:70000': port 70000 is outside 1..65535" in problems
+
+
 def test_many_close_starts_are_summarised() -> None:
     problems = refusals(None, "swarm.agents=50", "start.spacing_m=0.01")
     assert len(problems) == 4
