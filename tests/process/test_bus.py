@@ -18,7 +18,7 @@ from swarmctl.bus.marked_keys import MarkedPublisher
 from swarmctl.bus.refusals import HARMLESS, MISDELIVERED, RefusedMessage
 from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, STATUS, TICK, TOO_LONG
 from swarmctl.bus.zenoh_bus import COMMON_SETTINGS, SCHEME, ZenohBus, close_session, open_session
-from swarmctl.errors import StartError
+from swarmctl.errors import EXIT_START, EXIT_USAGE, StartError
 from tests.benches.router_process import start_router
 
 pytestmark = pytest.mark.process
@@ -258,15 +258,15 @@ def test_refusals_name_endpoint_and_fix(endpoint: str, tmp_path: Path) -> None:
     with pytest.raises(StartError, match=r"absent.sock.*python -m swarmctl.bus.network.router"):
         ZenohBus(f"{SCHEME}{tmp_path}/absent.sock", "run", "agent-0", {}, connect_timeout_ms=300)
     tmp_path.chmod(0o755)
-    for bad, word in (
-        (endpoint, "another router"),
-        (f"{SCHEME}{tmp_path}/bus.sock", "0700"),
-        (f"{SCHEME}/tmp/{'x' * 200}/bus.sock", "longer"),
-        ("tcp/127.0.0.1:7447", SCHEME),
+    for bad, word, code in (
+        (endpoint, "another router", EXIT_START),
+        (f"{SCHEME}{tmp_path}/bus.sock", "0700", EXIT_START),
+        (f"{SCHEME}/tmp/{'x' * 200}/bus.sock", "longer", EXIT_START),
+        ("tcp/127.0.0.1:7447", SCHEME, EXIT_USAGE),
     ):
         command = [sys.executable, "-m", "swarmctl.bus.network.router", bad]
         answer = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
-        assert answer.returncode == 3, answer
+        assert answer.returncode == code, answer
         assert word in answer.stderr
         assert bad in answer.stderr
 
