@@ -45,8 +45,9 @@ TWO_ARDUCOPTERS = (
     "--set=swarm.agents=2",
     '--set=vehicles=[{sysid=1, url="udpin://127.0.0.1:14550"}, {sysid=2, url="udpin://127.0.0.1:14560"}]',
 )
-LEAST_CHARGE, FULL_PERCENT = "SIM_BAT_MIN_PCT", 90.0  # to which a simulated PX4's battery is drained, in 6 s
-WORN_S = 14.0  # within which another 5 % are used up, and taken for worn
+LEAST_CHARGE, FULL_PERCENT = "SIM_BAT_MIN_PCT", 90.0  # to which a simulated PX4's battery is drained
+DRAINED_IN, FAST_S = "SIM_BAT_DRAIN", 20.0  # time from full to empty
+WORN_S, LAUNCHER_WAITS_S = 4.0, 10.0  # until worn batteries are acted on; until it lands who is silent
 PASSED_M = 4.0
 CHATTERING = "tests.benches.misbehaving:Chattering"
 SILENT_FROM_M = 13.0  # of two at 2.3 m/s each
@@ -120,7 +121,7 @@ def test_worn_batteries_lead_nobody_home_past_who_it_does_not_hear(field: Fielde
         here.witness.set_parameter(index, LEAST_CHARGE, FULL_PERCENT)
         assert here.witness.read_parameter(index, LEAST_CHARGE) == FULL_PERCENT
     swap = ("mission.kind=swap", "mission.swap.travel_s=12", "start.positions_ned_m=[[10,0,-3],[-10,0,-3]]")
-    worn = ("agent.failsafe.battery_warn_01=0.87", "agent.failsafe.battery_rtl_01=0.85")
+    worn = [f"agent.failsafe.{key}" for key in ("battery_warn_01=0.87", "battery_rtl_01=0.85", "window_s=1")]
     sets = (f"--set={each}" for each in (*swap, *worn))
     launched = here.launch(PX4_CONFIG, "--agents", "2", *sets, "--duration", "40")
     launched.until_phase("TRACK", 2)
@@ -128,10 +129,11 @@ def test_worn_batteries_lead_nobody_home_past_who_it_does_not_hear(field: Fielde
     here.witness.wait(lambda: ahead_m(here) > PASSED_M, 30.0, "past each other")
     os.kill(router, signal.SIGSTOP)
     for index in range(2):
-        here.witness.set_parameter(index, LEAST_CHARGE, 10.0)
+        here.witness.set_parameter(index, DRAINED_IN, FAST_S)
+        here.witness.set_parameter(index, LEAST_CHARGE, 50.0)
     time.sleep(WORN_S)
     before_m = apart_m(here)
-    time.sleep(4.0)
+    time.sleep(LAUNCHER_WAITS_S - WORN_S - 1.0)
     after_m, heard_us = apart_m(here), time.time_ns() // 1000
     os.kill(router, signal.SIGCONT)
     assert launched.end(END_S) == EXIT_MISSION, launched.text()
@@ -140,6 +142,8 @@ def test_worn_batteries_lead_nobody_home_past_who_it_does_not_hear(field: Fielde
     for agent in ("agent-0", "agent-1"):
         (turned_us,) = (row["utc_us"] for row in launched.events("escalation", agent) if row["response"] == "RTL")
         assert turned_us < heard_us - 4e6, "its battery was worn before"
+        landed_us = [row["utc_us"] for row in launched.events("land") if row["utc_us"] < heard_us]
+        assert not landed_us, "by the launcher, which does not hear them"
     assert abs(after_m - before_m) < 0.3, "they rest"
     assert here.witness.min_separation_m() > BODIES_M
 
