@@ -106,10 +106,10 @@ def refuse_no_folder(directory: Path) -> None:
     Raises:
         ConfigError: it does not.
     """
-    if directory.exists() and not directory.is_dir():
-        raise ConfigError(str(directory), ["is a file. Give the run folder that it is in"])
     if not directory.is_dir():
-        raise ConfigError(str(directory), ["no such run folder. Give one that launch or simulate wrote"])
+        there = "is a file. Give the run folder that it is in"
+        none = "no such run folder. Give one that launch or simulate wrote"
+        raise ConfigError(str(directory), [there if directory.exists() else none])
 
 
 def read_rows(path: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:

@@ -310,15 +310,16 @@ def refuse_as_output(output: Path, directory: Path, suffix: str) -> None:
 
 
 def _refuse_recorded(directory: Path) -> None:
-    """Check that nobody holds the files of an unfinished run, which are packed and removed when it is finished.
+    """Check that nobody holds the folder of an unfinished run, or its files, which are packed and then removed.
 
     Raises:
         StartError: somebody does.
     """
-    for pattern in ("*.ticks", "*.plans", "*.received", events_file("*"), TRUTH):
-        for path in (directory.resolve(), *sorted(directory.glob(pattern))):
-            if is_held(path):
-                raise StartError(f"{path}: is still written: the run is not over. Wait until its agents have ended")
+    patterns = ("*.ticks", "*.plans", "*.received", events_file("*"), TRUTH)
+    files = (path for pattern in patterns for path in sorted(directory.glob(pattern)))
+    for path in (directory.resolve(), *files):
+        if is_held(path):
+            raise StartError(f"{path}: is still written: the run is not over. Wait until its agents have ended")
 
 
 def write_run_figures(directory: Path, rules: Rules, *, png: bool = False) -> Path:
