@@ -10,10 +10,12 @@ import numpy as np
 
 from swarmctl.config import Config
 from swarmctl.configuration.constraints import is_tick
+from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.control.reference.kinds.csv_table import CsvParams
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.text import point_text
 from swarmctl.core.types import Array
+from swarmctl.telemetry.evaluation.referee import Rules
 
 _BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
 _SHOWN = 3
@@ -110,13 +112,29 @@ def _first(found: Sequence[str], others: str) -> Iterator[str]:
 
 
 def _judged_by_more_than_is_kept(config: Config) -> Iterator[str]:
-    """Yield that commitments keep less than the flight is judged by."""
+    """Yield that commitments keep less from vehicles, or from obstacles, than the flight is judged by."""
+    if config.separation.mode != "guaranteed":
+        return
     budget, limit_m = config.separation.budget, config.limits.min_separation_m
-    if config.separation.mode == "guaranteed" and budget.committed_m < limit_m - _SAME_M:
+    if budget.committed_m < limit_m - _SAME_M:
         keeps = f"separation.radius_m = {budget.radius_m:g}: commitments keep {budget.committed_m:.2f} m"
         fails = f"the flight fails below limits.min_separation_m = {limit_m:g}"
         enough_m = math.ceil(100.0 * budget.radius_that_commits_m(limit_m) - 1e-6) / 100.0
         yield f"{keeps}, and {fails}; {enough_m:.2f} m keeps that"
+    yield from _first(list(_obstacles_judged_by_more(config.rules(), budget)), "obstacles are judged by more")
+
+
+def _obstacles_judged_by_more(rules: Rules, budget: SeparationBudget) -> Iterator[str]:
+    """Yield the obstacles from which commitments keep less than the flight is judged by."""
+    for judged in rules.obstacles:
+        obstacle, required_m = judged.obstacle, judged.required_m(rules.obstacle_margin_m)
+        kept_m = budget.certified_obstacle_m(obstacle.keep_out_m)
+        if kept_m < required_m - _SAME_M:
+            keeps = f"obstacles.{judged.number}.keep_out_m = {obstacle.keep_out_m:g}: commitments keep {kept_m:.2f} m"
+            by_that = f"limits.obstacle_margin_m = {budget.certify_slack_m:g} judges by that"
+            enough = f"{obstacle.radius_m + budget.certify_slack_m:g} m keeps that"
+            fix = by_that if kept_m >= obstacle.radius_m - _SAME_M else enough
+            yield f"{keeps}, and the flight fails below {required_m:.2f} m; {fix}"
 
 
 def _stand_above_each_other(config: Config) -> Iterator[str]:
@@ -133,9 +151,14 @@ def _stand_above_each_other(config: Config) -> Iterator[str]:
 
 
 def _seen_too_late(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
-    """Yield which obstacles on the way are seen too late for a stop before their keep-outs begin."""
+    """Yield which obstacles on the way are seen too late for a stop before their keep-outs begin.
+
+    With guaranteed separation, that is later than the agent commits to fly there: it leaves a commitment only as far as
+    those of its peers allow.
+    """
     t_s = np.linspace(0.0, config.mission.duration_s, _SAMPLES)
     flown = [reference.sample(t_s) for reference in references if config.obstacles]
+    commits = config.separation.mode == "guaranteed"
     for number, obstacle in enumerate(config.obstacles):
         room_m, center_ned_m = obstacle.visibility_m - obstacle.keep_out_m, obstacle.center_after(t_s[:, None])
         for agent, (pos_ned_m, vel_ned_m_s) in enumerate(flown):
@@ -143,9 +166,15 @@ def _seen_too_late(config: Config, references: Sequence[MissionReference]) -> It
             towards_m_s = np.linalg.norm(vel_ned_m_s - np.array(obstacle.vel_ned_m_s), axis=1)
             speed_m_s = float(towards_m_s[sees].max(initial=0.0))
             stop_m = speed_m_s**2 / (2.0 * config.controller.mpc.accel_max_m_s2(config.model_of(agent)))
-            if stop_m > room_m:
+            ahead_m = config.agent.commit.stretch_m(speed_m_s) if commits else stop_m
+            if ahead_m > room_m:
                 seen = f"obstacles.{number}: agent {agent} sees it {room_m:.2f} m before its keep-out"
-                yield f"{seen}, at {speed_m_s:.1f} m/s, from which it stops in {stop_m:.2f} m; raise visibility_m"
+                stops = (
+                    f"by when it has committed to {ahead_m:.2f} m"
+                    if commits
+                    else f"from which it stops in {stop_m:.2f} m"
+                )
+                yield f"{seen}, at {speed_m_s:.1f} m/s, {stops}; raise visibility_m"
                 break
 
 

@@ -59,6 +59,10 @@ class JudgedObstacle:
     since_utc_us: int | None = None  # when it was at its centre; None: at the beginning of what was recorded
     until_utc_us: int | None = None  # when it was removed or changed; None: it never was
 
+    def required_m(self, margin_m: float) -> float:
+        """Return the least distance from its centre, or axis, if vehicles may be `margin_m` within its keep-out."""
+        return max(self.obstacle.keep_out_m - margin_m, self.obstacle.radius_m)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rules:
@@ -251,7 +255,7 @@ def _evaluate_obstacles(
     violations = []
     for judged in rules.obstacles:
         obstacle, until_utc_us = judged.obstacle, judged.until_utc_us
-        required_m = max(obstacle.keep_out_m - rules.obstacle_margin_m, obstacle.radius_m)
+        required_m = judged.required_m(rules.obstacle_margin_m)
         since_us = clock.first_us if judged.since_utc_us is None else judged.since_utc_us - clock.utc_offset_us
         elapsed_s = (tracks.t_us - since_us) / 1e6
         center_ned_m = obstacle.center_after(elapsed_s[:, None])  # (T, 3)

@@ -38,6 +38,19 @@ def test_commitments_that_keep_less_than_the_flight_is_judged_by_are_named() -> 
     assert lines(guaranteed, "separation.radius_m=0.95") == lines(guaranteed, "limits.min_separation_m=0.8") == []
 
 
+def test_commitments_that_keep_less_from_an_obstacle_than_the_flight_is_judged_by_are_named() -> None:
+    """The built-in obstacle flight came to 1.680 m, where 1.73 m were required."""
+    keeps = ("separation.mode=guaranteed", "separation.radius_m=0.95")
+    wide, narrow = (f"obstacles=[{{center_ned_m=[20,20,-1],radius_m=1,keep_out_m={m}}}]" for m in (1.78, 1.05))
+    (said,) = lines(*keeps, wide)
+    assert said.startswith("obstacles.0.keep_out_m = 1.78: commitments keep 1.68 m, and the flight fails below 1.73 m;")
+    assert said.endswith("; limits.obstacle_margin_m = 0.1 judges by that")
+    assert lines(*keeps, wide, "limits.obstacle_margin_m=0.1") == lines(wide) == []
+    (said,) = lines(*keeps, narrow, "limits.obstacle_margin_m=0.1")
+    assert said.endswith("commitments keep 0.95 m, and the flight fails below 1.00 m; 1.1 m keeps that")
+    assert lines(*keeps, narrow.replace("1.05", "1.1"), "limits.obstacle_margin_m=0.1") == []
+
+
 def test_starts_that_only_heights_keep_apart_are_named() -> None:
     hover = ("swarm.agents=2", "mission.kind=hover", "start.positions_ned_m=[[0,0,-1],[0.7,0,-4]]")
     (said,) = lines(*hover)
@@ -58,6 +71,21 @@ def test_an_obstacle_on_the_way_that_is_seen_too_late_is_named(speed_m_s: float,
     assert len(said) == is_named
     assert all("obstacles.0: agent 0 sees it 1.25 m before its keep-out, at" in line for line in said)
     assert lines(*alone, tilts, "sitl.start=air", aside) == []
+
+
+def test_an_obstacle_that_is_seen_later_than_is_committed_is_named() -> None:
+    """Three in formation, one of them straight at it, came 0.2 m closer than they certify; seen from afar they do not."""
+    goto = "mission.goto={goals_ned_m=[[60,0,0]],speed_m_s=1.5}"
+    alone = ("swarm.agents=1", "mission.kind=goto", goto, "start.positions_ned_m=[[0,0,0]]", "mission.duration_s=99")
+    late, early = (f"obstacles=[{{center_ned_m=[30,0.1,-1],visibility_m={m}}}]" for m in (3.0, 6.3))
+    keeps = ("separation.mode=guaranteed", "separation.radius_m=0.95", "limits.obstacle_margin_m=0.1")
+    commits = (*alone, "sitl.start=air", *keeps)
+    (said,) = lines(*commits, late)
+    assert said == (
+        "obstacles.0: agent 0 sees it 1.25 m before its keep-out, at 1.5 m/s, by when it has committed to 4.50 m; "
+        "raise visibility_m"
+    )
+    assert lines(*commits, early) == lines(*alone, "sitl.start=air", late) == []
 
 
 def test_a_reference_that_asks_for_more_than_the_controller_may_tilt_is_named() -> None:
