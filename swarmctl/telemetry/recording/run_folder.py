@@ -82,8 +82,8 @@ def create_run_folder(
         advice: what to do where it can't be made.
 
     Raises:
-        ConfigError: `base` contains a run already, or a symbolic link through which files would be written, or its name
-            is no text.
+        ConfigError: `base` contains a run already, or a symbolic link through which files would be written, is a file
+            or within one, or its name is no text.
         StartError: the folder can't be created.
     """
     try:
@@ -104,6 +104,8 @@ def create_run_folder(
     except UnicodeEncodeError as error:
         raise ConfigError("--run-dir", [f"{base!r} is no text in UTF-8. Choose another name"]) from error
     except OSError as error:
+        if base is not None and isinstance(error, FileExistsError | NotADirectoryError):
+            raise ConfigError(f"--run-dir {base}", ["is a file, or within one. Choose another folder"]) from error
         raise StartError(f"run folder can't be made: {error}. {advice}") from error
     raise StartError(f"runs/{stamp}-{name}: {_LAUNCHES_PER_SECOND} launches in one second")
 

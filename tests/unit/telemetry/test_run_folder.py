@@ -86,10 +86,17 @@ def test_a_given_folder_is_used_once(tmp_path: Path) -> None:
         create_run_folder(folder, "circle", UTC_US)
 
 
+@pytest.mark.parametrize("within", ["", "run0"])
+def test_a_folder_that_is_a_file_is_refused_as_a_wrong_option(tmp_path: Path, within: str) -> None:
+    (tmp_path / "notes").write_text("mine")
+    with pytest.raises(ConfigError, match="is a file, or within one"):
+        create_run_folder(tmp_path / "notes" / within, "a", 0)
+    assert (tmp_path / "notes").read_text() == "mine"
+
+
 def test_folder_that_cannot_be_made_is_a_start_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
     with pytest.raises(StartError, match="--run-dir"):
-        create_run_folder(tmp_path / "file" / "run", "circle", UTC_US)
+        create_run_folder(tmp_path / ("n" * 300), "circle", UTC_US)
 
 
 def test_parquet_gives_back_every_column(tmp_path: Path) -> None:
