@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from swarmctl.configuration.source import shown
 from swarmctl.core.params import OTHER_KEY, Params
-from swarmctl.core.text import printable
+from swarmctl.core.text import counted, printable
 from swarmctl.errors import ConfigError
 
 _PLACES_SHOWN = 3
@@ -88,7 +88,7 @@ def _about_vector(error: Mapping[str, Any], location: Sequence[str], within: str
     parts = [*([within] if within else []), *(location[:-1] if error["type"] == "missing" else location)]
     name = next((part for part in reversed(parts) if not part.isdigit()), "")
     wanted = next((names for suffix, names in _COMPONENTS.items() if suffix in name), None)
-    count = f"{len(error['input'])} value{'' if len(error['input']) == 1 else 's'}"
+    count = counted(len(error["input"]), "value")
     needed = "more are needed" if error["type"] == "missing" else error["msg"]
     key = printable(".".join(parts), 100)
     return f"{key} = {shown(error['input'])}: {count}; {needed if wanted is None else f'give {wanted}'}"

@@ -1,4 +1,4 @@
-"""Sanitising of text from outside, so that no vehicle, peer or file can control a terminal."""
+"""Words for people: text from outside that can control no terminal, and how points and counts are written."""
 
 from __future__ import annotations
 
@@ -20,6 +20,11 @@ def printable(text: str, most: int = MOST_SHOWN) -> str:
 def point_text(point: Iterable[float]) -> str:
     """Return the numbers of a point as an operator writes them: "5, -2, -3"."""
     return ", ".join(f"{part:g}" for part in point)
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun: "1 obstacle", "2 obstacles"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def told_apart(values: Sequence[str], most: int) -> list[str]:

@@ -32,6 +32,7 @@ from swarmctl.configuration.problems import validated
 from swarmctl.configuration.source import read_tree
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
+from swarmctl.core.text import counted
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import write_new
 from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, joined, list_keepers, list_setters, vector
@@ -275,7 +276,7 @@ def as_json(known: ObstaclesMessage) -> str:
 
 def lines_of(known: ObstaclesMessage) -> list[str]:
     """Return a headline and one line for each obstacle as it is now."""
-    lines = [f"{len(known.obstacles)} obstacles, where they are now, shared NED [m]"]
+    lines = [f"{counted(len(known.obstacles), 'obstacle')}, where they are now, shared NED [m]"]
     for item in known.obstacles:
         there = item.at(known.utc_us)
         shape, speed = "column" if there.column else "sphere", f"velocity {_words(there.vel_ned_m_s)} m/s"

@@ -17,6 +17,7 @@ from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.topics import COMMAND
 from swarmctl.config import Config
 from swarmctl.core.operator_verbs import Order
+from swarmctl.core.text import counted
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.orders.operator import list_setters
@@ -124,7 +125,7 @@ class FlightSupervisor:
             interrupts: number of stop requests; the first lands all agents, the second kills all processes.
         """
         if configured := self._obstacles.newest.obstacles:
-            text = f"{len(configured)} obstacles, as configured"
+            text = f"{counted(len(configured), 'obstacle')}, as configured"
             self._services.log.write("obstacles", text=text, **recorded_list(self._obstacles.newest))
         while interrupts() < 2:
             self._own_pause.excuse(time.monotonic(), self._views)
@@ -182,7 +183,7 @@ class FlightSupervisor:
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         adopted = self._obstacles.receive()
         for adoption in adopted:
-            text = f"{len(adoption.after.obstacles)} obstacles, set by an operator"
+            text = f"{counted(len(adoption.after.obstacles), 'obstacle')}, set by an operator"
             self._announce("obstacles", text, **recorded_list(adoption.after))
         for event, text in self._obstacles.news(adopted):
             self._announce(event, text)

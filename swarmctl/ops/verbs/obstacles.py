@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from swarmctl.core.text import counted
 from swarmctl.errors import EXIT_OK, MissionError
 from swarmctl.ops.verbs.orders import AsJson, Run
 
@@ -124,7 +125,7 @@ def obstacle_save(
 
     known = obstacle_list.read_obstacles(running_launches.find_launch(run)).listed
     obstacle_list.write_file(file, known)
-    print(obstacle_list.as_json(known) if as_json else f"{len(known.obstacles)} obstacles: {file}")
+    print(obstacle_list.as_json(known) if as_json else f"{counted(len(known.obstacles), 'obstacle')}: {file}")
     return EXIT_OK
 
 

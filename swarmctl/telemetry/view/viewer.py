@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 import psutil
 
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.text import counted
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
 from swarmctl.files import replace_text
 from swarmctl.process_lifetime import StopRequest, die_with_parent
@@ -145,7 +146,7 @@ class Pump:
         newer = self._feed.take_obstacles()
         if newer is not None:
             self._obstacles, self._set_us, self._drawn_us = newer, self._newest_us, None
-            self._scene.log("operator", self._newest_us, "INFO", f"{len(newer)} obstacles")
+            self._scene.log("operator", self._newest_us, "INFO", counted(len(newer), "obstacle"))
         self._draw_obstacles()
 
     def _draw_obstacles(self) -> None:

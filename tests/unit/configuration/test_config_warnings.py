@@ -74,7 +74,7 @@ def test_an_obstacle_on_the_way_that_is_seen_too_late_is_named(speed_m_s: float,
 
 
 def test_an_obstacle_that_is_seen_later_than_is_committed_is_named() -> None:
-    """Three in formation, one of them straight at it, came 0.2 m closer than they certify; seen from afar they do not."""
+    """Three in formation, one of them straight at it, came 0.2 m closer than they certify; seen from afar none does."""
     goto = "mission.goto={goals_ned_m=[[60,0,0]],speed_m_s=1.5}"
     alone = ("swarm.agents=1", "mission.kind=goto", goto, "start.positions_ned_m=[[0,0,0]]", "mission.duration_s=99")
     late, early = (f"obstacles=[{{center_ned_m=[30,0.1,-1],visibility_m={m}}}]" for m in (3.0, 6.3))

@@ -114,6 +114,7 @@ def test_the_list_shows_where_obstacles_are_now() -> None:
         "0: sphere at 5.00, 0.00, -2.00  radius 0.5  keep-out 1  seen from 3  at rest",
         "1: column at 4.00, 10.00, -2.00  radius 1  keep-out 1.75  seen from 3  velocity 1.00, 0.00, 0.00 m/s",
     ]
+    assert obstacle_list.lines_of(first_list((BALL,), UTC_US))[0].startswith("1 obstacle, where")
     shown = msgspec.json.decode(obstacle_list.as_json(known))
     assert [(item["number"], item["center_ned_m"]) for item in shown] == [(0, [5.0, 0.0, -2.0]), (1, [4.0, 10.0, -2.0])]
 
