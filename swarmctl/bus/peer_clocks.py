@@ -40,13 +40,14 @@ class _PeerClock:
         ahead_us: how far it is taken to be ahead.
         reported_us: what was reported of that.
         interval_us: least and most that it can be ahead.
+        error_us: largest error that `ahead_us` may have.
     """
 
     def __init__(self) -> None:
         self._now, self._before = _Bounds(), _Bounds()
         self._since_us = 0
         self.ahead_us = self.reported_us = 0
-        self.interval_us = (-_UNKNOWN_US, _UNKNOWN_US)
+        self.interval_us, self.error_us = (-_UNKNOWN_US, _UNKNOWN_US), _UNKNOWN_US
 
     def narrow(self, low_us: int, high_us: int, utc_us: int) -> None:
         """Take in new bounds, and correct what is applied if it is impossible now."""
@@ -62,13 +63,7 @@ class _PeerClock:
             low, high = low_us, high_us
         if not low <= self.ahead_us <= high and low > -_UNKNOWN_US and high < _UNKNOWN_US:
             self.ahead_us = (low + high) // 2
-        self.interval_us = low, high
-
-    @property
-    def error_us(self) -> int:
-        """Return the largest error that `ahead_us` may have."""
-        low, high = self.interval_us
-        return max(high - self.ahead_us, self.ahead_us - low)
+        self.interval_us, self.error_us = (low, high), max(high - self.ahead_us, self.ahead_us - low)
 
     def _interval_us(self) -> tuple[int, int]:
         """Return the bounds by all that is kept."""

@@ -13,7 +13,7 @@ from swarmctl.bus.peers import MAX_LEAD_US, peer_verifiers
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage
 from swarmctl.bus.topics import TRAJECTORY
-from swarmctl.core.trajectory_message import TrajectoryMessage
+from swarmctl.core.trajectory_message import Exclusions, TrajectoryMessage
 
 MAX_BEGIN_US = 10_000_000  # from now; a trajectory that begins later comes from another clock
 MAX_CLOCK_ERROR_US = 10_000_000  # a clock known less well is known as badly; nothing is committed then
@@ -50,6 +50,7 @@ class PeerTrajectories:
         self.peer_count = len(self._verifiers)  # heard or not
         self.newest: dict[int, TrajectoryMessage] = {}
         self.telling: dict[int, TrajectoryMessage] = {}  # the newest of each peer that says what it has heard
+        self.exclusions: dict[int, Exclusions] = {}  # of the newest message of each peer
         self.received_utc_us: dict[int, int] = {}  # when the newest message of each peer was accepted
         self.confirmed_us: dict[int, int] = {}  # stamp of the newest own message that each peer says to have heard
         self.heard_before_flight: set[int] = set()  # peers that did not fly by commitments when first heard
@@ -71,6 +72,7 @@ class PeerTrajectories:
             if message.agent not in self.newest and not message.is_committed:
                 self.heard_before_flight.add(message.agent)
             self.newest[message.agent], self._memory[sender] = message, memory
+            self.exclusions[message.agent] = message.exclusions
             if message.heard or message.agent not in self.telling:
                 self.telling[message.agent] = message
             self.received_utc_us[message.agent] = utc_us

@@ -6,14 +6,10 @@ peer's newest path whatever its age; what an old path means for separation is de
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
-from dataclasses import replace
-
-import numpy as np
 
 from swarmctl.bus.bus import agent_name
-from swarmctl.bus.messages.path_messages import decode_path
+from swarmctl.bus.messages.path_messages import decode_path, longest_step_m
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
@@ -69,7 +65,7 @@ class PeerPaths:
             payload: bytes as received.
             utc_us: now, disciplined UTC [us].
         """
-        path = self._by_own_clock(decode_path(payload))
+        path = self._by_own_clock(decode_path(payload), payload)
         if path is None or (reason := self._refusal(sender, path, utc_us)):
             self.refusals.add(sender, PATH.name, MALFORMED if path is None else reason, utc_us)
             return None
@@ -82,17 +78,23 @@ class PeerPaths:
             self._newest = dict(sorted(self._newest.items()))
         return path
 
-    def _by_own_clock(self, path: PredictedPath | None) -> PredictedPath | None:
+    def _by_own_clock(self, path: PredictedPath | None, payload: bytes) -> PredictedPath | None:
         """Return the path at times of the own clock, with room for the error that is left of the peer's."""
         if path is None or self._clocks is None:
             return path
         ahead_us, spread_us = self._clocks.ahead_us(path.agent), self._clocks.spread_us(path.agent)
         if not ahead_us and not spread_us:
             return path
-        steps_m = path.pos_ned_m[1:] - path.pos_ned_m[:-1]
-        fastest_m_us = math.sqrt(float(np.einsum("kc,kc->k", steps_m, steps_m).max())) / path.dt_us
-        margin_m = min(MAX_MARGIN_M, path.margin_m + spread_us * fastest_m_us)
-        return replace(path, t0_utc_us=path.t0_utc_us - ahead_us, margin_m=margin_m)
+        fastest_m_us = longest_step_m(payload) / path.dt_us
+        return PredictedPath(
+            agent=path.agent,
+            boot_id=path.boot_id,
+            seq=path.seq,
+            t0_utc_us=path.t0_utc_us - ahead_us,
+            dt_us=path.dt_us,
+            margin_m=min(MAX_MARGIN_M, path.margin_m + spread_us * fastest_m_us),
+            pos_ned_m=path.pos_ned_m,
+        )
 
     def latest(self) -> tuple[PredictedPath, ...]:
         """Return the newest path of every peer, whatever its age, sorted by agent number."""

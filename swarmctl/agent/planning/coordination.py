@@ -144,10 +144,9 @@ class Coordination:
         peers, membership = self._peer_trajectories, self._membership
         self._ended = self._world_model.statuses.ended
         suspected = self._suspected(utc_us)
-        told = {agent: message.exclusions for agent, message in peers.newest.items()}
         # Before the flight; who is started again knows of nobody so.
         came = self._peers - self._world_model.statuses.excused
-        membership.update(suspected, told, self._ended, votes=peers.heard_before_flight >= came)
+        membership.update(suspected, peers.exclusions, self._ended, votes=peers.heard_before_flight >= came)
         said = (membership.exclusions.suspected, membership.exclusions.promised, membership.excluded)
         if said != self._membership_said:
             self._membership_said = said
@@ -352,8 +351,7 @@ class Coordination:
         """
         newest, excluded = self._peer_trajectories.newest, self._membership.excluded
         unseen = {agent for agent in excluded & newest.keys() if self._agent in newest[agent].reach.far}
-        participants = self._peers - (excluded - unseen) - self._ended
-        return frozenset(agent for agent in participants if self._world_model.statuses.uses_commitments(agent))
+        return self._peers - (excluded - unseen) - self._ended - self._world_model.statuses.uncommitted
 
     def _absent(self) -> set[int]:
         """Return peers whose liveliness token is not on the bus."""

@@ -43,6 +43,9 @@ class PeerStatuses:
         presence: when each sender came.
         clocks: of the peers; is told what statuses say of them.
         vouchers: agents of which each sender may say that they have ended.
+
+    Attributes:
+        uncommitted: peers whose status says that they do not fly by commitments.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class PeerStatuses:
         self._heard_us: dict[int, int] = {}  # UTC of the newest one's arrival
         self._ended: frozenset[int] | None = frozenset()  # peers that have; None: to be found out anew
         self._lag_told = -1  # peer whose lag was told last
+        self.uncommitted: frozenset[int] = frozenset()
 
     def take(self, sender: str, payload: bytes, utc_us: int) -> StatusMessage | None:
         """Keep a status that has arrived, and return it; None if it is refused."""
@@ -92,6 +96,8 @@ class PeerStatuses:
         self._newest[status.agent], self._heard_us[status.agent], self._ended = status, utc_us, None
         if not status.uses_commitments:  # trajectory messages say more of the clocks of those that commit
             self._measure_clock(status, utc_us)
+        if status.uses_commitments is (status.agent in self.uncommitted):
+            self.uncommitted ^= {status.agent}
         return status
 
     def _is_far_ahead(self, status: StatusMessage, utc_us: int) -> bool:
@@ -166,11 +172,6 @@ class PeerStatuses:
     def is_done(self, agent: int) -> bool:
         """Return whether a peer has said that its mission has ended."""
         return self._is_in(agent, Phase.DONE)
-
-    def uses_commitments(self, agent: int) -> bool:
-        """Return whether a peer flies by commitments; true while its status is unknown."""
-        status = self._newest.get(agent)
-        return status is None or status.uses_commitments
 
     def codes(self) -> dict[int, str]:
         """Return the code that each peer flies, as its status says; "" where it does not."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import ItemsView, Iterator, Mapping
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -28,9 +28,11 @@ _HAS_PROPOSAL, _IS_COMMITTED, _ASKS_FAR = 1, 2, 4
 _FLAGS = _HAS_PROPOSAL | _IS_COMMITTED | _ASKS_FAR
 _PROPOSAL = struct.Struct("<Qq")  # number, time of proposal
 _TRAJECTORY = struct.Struct("<qiH2x")
+_POINT_BYTES = 24  # position and velocity
 _ACKNOWLEDGEMENT = struct.Struct("<IQ")
 _HEARD = struct.Struct("<Iqq")
 _AGENT = struct.Struct("<I")
+_REMEMBERED = 256  # messages: two of each of a hundred agents, which all hear within a tick
 
 Memory = dict[bytes, Trajectory]  # decoded trajectories by their bytes
 
@@ -45,7 +47,7 @@ class HeardTimes(Mapping[int, tuple[int, int]]):
     def __init__(self, encoded: bytes) -> None:
         self._encoded = encoded
 
-    @property
+    @cached_property
     def oldest_us(self) -> int:
         """Return the earliest arrival of all; 0 if nobody was heard."""
         return min([arrival for _, _, arrival in _HEARD.iter_unpack(self._encoded)], default=0)
@@ -112,6 +114,58 @@ def decode_trajectory_message(
     which the protocol knows that it has checked it before. The sender's clock is `ahead_us` ahead of the own one, to
     which its trajectories are converted, give or take `error_us`; the memory must be of the same correction.
     """
+    read = _read(payload)
+    if read is None:
+        return None
+    by_sender, bodies = read
+    known, own = memory or {}, Memory()
+    for body, trajectory in zip(bodies, by_sender.trajectories, strict=True):
+        repeated = known.get(body)
+        own[body] = _by_own_clock(trajectory, ahead_us, error_us) if repeated is None else repeated
+    if memory is not None:
+        memory.clear()
+        memory.update(own)
+    proposal = by_sender.proposal
+    if proposal is not None:
+        proposal = Proposal(
+            number=proposal.number,
+            made_utc_us=proposal.made_utc_us,
+            agent=proposal.agent,
+            trajectory=own[bodies[-1]],
+            asks_far=proposal.asks_far,
+        )
+    return TrajectoryMessage(
+        agent=by_sender.agent,
+        boot_id=by_sender.boot_id,
+        seq=by_sender.seq,
+        sent_utc_us=by_sender.sent_utc_us,
+        is_committed=by_sender.is_committed,
+        committed=own[bodies[0]],
+        tube_m=by_sender.tube_m,
+        proposal=proposal,
+        acknowledged=by_sender.acknowledged,
+        exclusions=by_sender.exclusions,
+        heard=by_sender.heard,
+        reach=by_sender.reach,
+    )
+
+
+def _by_own_clock(trajectory: Trajectory, ahead_us: int, error_us: int) -> Trajectory:
+    return Trajectory(
+        t0_utc_us=trajectory.t0_utc_us - ahead_us,
+        dt_us=trajectory.dt_us,
+        pos_ned_m=trajectory.pos_ned_m,
+        vel_ned_m_s=trajectory.vel_ned_m_s,
+        clock_error_us=error_us,
+    )
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _read(payload: bytes) -> tuple[TrajectoryMessage, tuple[bytes, ...]] | None:
+    """Return a message by its sender's clock, and the bytes of its trajectories; None if it is not valid.
+
+    All agents of a process that hear it read it once.
+    """
     try:
         magic, version, flags, agent, boot_id, seq, sent_utc_us, *numbers = _HEADER.unpack_from(payload)
         (tube_m, speed_m_s, stretch_m), counts = numbers[:3], numbers[3:]
@@ -120,18 +174,17 @@ def decode_trajectory_message(
         if not 0.0 <= tube_m <= MAX_TUBE_M or not speed_m_s >= 0.0 or not stretch_m >= 0.0:
             return None
         acknowledgements, heard, suspected, promised, far = counts
-        known, sent = memory or {}, Memory()
-        clock = (ahead_us, error_us)
-        committed, at = _decode_trajectory(payload, _HEADER.size, known, sent, clock)
-        proposal = None
+        body, at = _body(payload, _HEADER.size)
+        bodies, committed, proposal = [body], _decode_trajectory(body), None
         if flags & _HAS_PROPOSAL:
             number, made_utc_us = _PROPOSAL.unpack_from(payload, at)
-            trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, sent, clock)
+            body, at = _body(payload, at + _PROPOSAL.size)
+            bodies.append(body)
             proposal = Proposal(
                 number=number,
                 made_utc_us=made_utc_us,
                 agent=agent,
-                trajectory=trajectory,
+                trajectory=_decode_trajectory(body),
                 asks_far=bool(flags & _ASKS_FAR),
             )
         heard_at = at + acknowledgements * _ACKNOWLEDGEMENT.size
@@ -140,11 +193,7 @@ def decode_trajectory_message(
         far_at = promised_at + promised * _AGENT.size
         if len(payload) != far_at + far * _AGENT.size:
             return None
-        acknowledged = dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:heard_at]))
-        if memory is not None:
-            memory.clear()
-            memory.update(sent)
-        return TrajectoryMessage(
+        message = TrajectoryMessage(
             agent=agent,
             boot_id=boot_id,
             seq=seq,
@@ -153,7 +202,7 @@ def decode_trajectory_message(
             committed=committed,
             tube_m=tube_m,
             proposal=proposal,
-            acknowledged=acknowledged,
+            acknowledged=dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:heard_at])),
             exclusions=Exclusions(
                 suspected=_agents(payload[suspected_at:promised_at]), promised=_agents(payload[promised_at:far_at])
             ),
@@ -162,6 +211,7 @@ def decode_trajectory_message(
         )
     except (struct.error, ValueError):
         return None
+    return message, tuple(bodies)
 
 
 @lru_cache(maxsize=1024)
@@ -182,37 +232,31 @@ def _encode_trajectory(trajectory: Trajectory) -> bytes:
     return _TRAJECTORY.pack(trajectory.t0_utc_us, trajectory.dt_us, len(points)) + points.tobytes()
 
 
-def _decode_trajectory(
-    payload: bytes, at: int, known: Memory, sent: Memory, clock: tuple[int, int]
-) -> tuple[Trajectory, int]:
-    """Return the trajectory encoded at offset `at`, and the offset of its end.
-
-    Args:
-        payload, at: bytes of a message.
-        known, sent: trajectories of the previous message, and of this one.
-        clock: how far the sender's is ahead, and the error of that [us].
+def _body(payload: bytes, at: int) -> tuple[bytes, int]:
+    """Return the bytes of the trajectory at offset `at`, and the offset of their end.
 
     Raises:
-        ValueError, struct.error: the bytes are no trajectory.
+        struct.error: there is none.
     """
-    t0_utc_us, dt_us, count = _TRAJECTORY.unpack_from(payload, at)
-    end = at + _TRAJECTORY.size + 24 * count
-    body = payload[at:end]
-    if body in known:
-        sent[body] = known[body]
-        return sent[body], end
-    at += _TRAJECTORY.size
-    if not 2 <= count <= MAX_POINTS or not 0 < dt_us <= MAX_STEP_US or len(payload) < at + 24 * count:
+    _, _, count = _TRAJECTORY.unpack_from(payload, at)
+    end = at + _TRAJECTORY.size + _POINT_BYTES * count
+    return payload[at:end], end
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _decode_trajectory(body: bytes) -> Trajectory:
+    """Return a trajectory by its sender's clock; messages repeat it until the next one.
+
+    Raises:
+        ValueError: the bytes are no trajectory.
+    """
+    t0_utc_us, dt_us, count = _TRAJECTORY.unpack_from(body)
+    is_whole = len(body) == _TRAJECTORY.size + _POINT_BYTES * count
+    if not 2 <= count <= MAX_POINTS or not 0 < dt_us <= MAX_STEP_US or not is_whole:
         raise ValueError("no trajectory")
-    points: Array = np.frombuffer(payload, "<f4", 6 * count, at).reshape(count, 6).astype(np.float64)
+    points: Array = np.frombuffer(body, "<f4", 6 * count, _TRAJECTORY.size).reshape(count, 6).astype(np.float64)
     if not np.isfinite(points).all():
         raise ValueError("not finite")
-    ahead_us, error_us = clock
-    sent[body] = Trajectory(
-        t0_utc_us=t0_utc_us - ahead_us,
-        dt_us=dt_us,
-        pos_ned_m=points[:, :3].copy(),
-        vel_ned_m_s=points[:, 3:].copy(),
-        clock_error_us=error_us,
-    )
-    return sent[body], end
+    pos_ned_m, vel_ned_m_s = points[:, :3].copy(), points[:, 3:].copy()
+    pos_ned_m.flags.writeable = vel_ned_m_s.flags.writeable = False  # of all agents of a process
+    return Trajectory(t0_utc_us=t0_utc_us, dt_us=dt_us, pos_ned_m=pos_ned_m, vel_ned_m_s=vel_ned_m_s)

@@ -30,6 +30,7 @@ _BEGIN_BYTES = 6 * _BEGIN.itemsize  # first point and first step
 _FINEST, _COARSEST = -16, -10  # exponents
 _FARTHEST_M = 2.0 ** (30 + _FINEST)  # 16 km; a step may be twice as long
 _LARGEST_BEND = 125  # units; two fewer than fit, by which rounding positions may change a difference of steps
+_REMEMBERED = 256  # paths: two of each of a hundred agents, which all hear within a tick
 _ROUNDING_01 = 0.5 * math.sqrt(3.0)  # largest distance, in units, of a point from its rounded one
 
 
@@ -87,8 +88,12 @@ def stamp_us(payload: bytes) -> int:
     return int(_HEADER.unpack_from(payload)[6]) if len(payload) >= _HEADER.size else 0
 
 
+@lru_cache(maxsize=_REMEMBERED)
 def decode_path(payload: bytes) -> PredictedPath | None:
-    """Decode a path; None unless magic, version, lengths and all numbers are valid."""
+    """Decode a path; None unless magic, version, lengths and all numbers are valid.
+
+    All agents of a process that hear it share the result, whose points are read-only.
+    """
     if len(payload) < _HEADER.size:
         return None
     (magic, version, _, agent, boot_id, seq, t0_utc_us, dt_us, margin_m, count, header_len, exponent) = (
@@ -106,6 +111,7 @@ def decode_path(payload: bytes) -> PredictedPath | None:
         return None
     if pos_ned_m is None:
         return None
+    pos_ned_m.flags.writeable = False
     return PredictedPath(
         agent=agent,
         boot_id=boot_id,
@@ -115,6 +121,16 @@ def decode_path(payload: bytes) -> PredictedPath | None:
         margin_m=margin_m,
         pos_ned_m=pos_ned_m,
     )
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def longest_step_m(payload: bytes) -> float:
+    """Return the largest distance [m] of two successive points of a path; 0 where there is none."""
+    path = decode_path(payload)
+    if path is None:
+        return 0.0
+    steps_m = path.pos_ned_m[1:] - path.pos_ned_m[:-1]
+    return math.sqrt(float(np.einsum("kc,kc->k", steps_m, steps_m).max()))
 
 
 def _points(body: bytes, count: int) -> Array | None:

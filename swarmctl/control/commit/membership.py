@@ -72,11 +72,12 @@ class Membership:
             ended: peers that take no part any more by evidence; they have no vote.
             votes: whether this agent has kept all its promises since the flight began.
         """
-        self.excluded_by = sorted(agent for agent, exclusions in told.items() if self._agent in exclusions.promised)
+        promising = {agent: exclusions for agent, exclusions in told.items() if exclusions.promised}
+        self.excluded_by = sorted(agent for agent, said in promising.items() if self._agent in said.promised)
         if not votes:
             return
         self._suspected = frozenset(suspected)
-        if not suspected and not self._promised and not any(exclusions.promised for exclusions in told.values()):
+        if not suspected and not self._promised and not promising:
             return  # as nearly always
         for agent in sorted(told):
             others = told[agent].promised

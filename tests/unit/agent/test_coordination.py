@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -53,6 +54,21 @@ def test_a_peer_that_was_heard_landed_and_disarmed_is_not_waited_for(bench: Benc
     bench.peer.publish(topics.STATUS, encode_message(done))
     bench.fly(0.5)
     assert bench.committed > before
+
+
+def test_a_peer_that_flies_in_best_effort_is_not_waited_for_until_it_commits_again(bench: Bench) -> None:
+    bench.fly(1.0, each=bench.send)
+    before = bench.committed
+    bench.fly(1.0)
+    assert bench.committed == before
+    for commits in (False, True):
+        status = builders.status_message(agent=1, utc_us=bench.clock.utc_us())
+        said = msgspec.structs.replace(status, uses_commitments=commits, ticks=100 + commits)
+        bench.peer.publish(topics.STATUS, encode_message(said))
+        bench.fly(0.5)
+        assert (bench.committed > before) is not commits
+        bench.fly(1.0)  # what was proposed meanwhile is decided
+        before = bench.committed
 
 
 def test_of_two_that_do_not_hear_each_other_none_excludes_the_other_and_both_land(bench: Bench) -> None:

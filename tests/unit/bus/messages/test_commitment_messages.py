@@ -303,6 +303,20 @@ def test_a_repeated_trajectory_is_the_same_object_again() -> None:
     assert store.peers.newest[2].committed is not before.committed
 
 
+def test_two_agents_of_a_process_have_one_message_by_the_clock_of_each() -> None:
+    """What they share can't be changed by one of them."""
+    payload = encode_trajectory_message(message())
+    one, other = decode_trajectory_message(payload), decode_trajectory_message(payload, {}, 400_000, 30)
+    assert one is not None and other is not None and one.proposal is not None and other.proposal is not None
+    assert (one.committed.t0_utc_us, one.committed.clock_error_us) == (UTC_US, 0)
+    assert (other.committed.t0_utc_us, other.committed.clock_error_us) == (UTC_US - 400_000, 30)
+    assert other.proposal.trajectory.t0_utc_us == one.proposal.trajectory.t0_utc_us - 400_000
+    assert (other.proposal.number, other.sent_utc_us) == (one.proposal.number, one.sent_utc_us)
+    for shared in (one.committed.pos_ned_m, other.proposal.trajectory.vel_ned_m_s):
+        with pytest.raises(ValueError, match="read-only"):
+            shared += 1.0
+
+
 def test_trajectories_of_a_peer_with_another_clock_are_converted_to_ours() -> None:
     store = Store()
     ahead_us = 400_000

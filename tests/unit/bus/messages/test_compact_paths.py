@@ -65,6 +65,15 @@ def test_forty_steps_take_less_than_two_hundred_bytes() -> None:
     assert len(encode_path(path(CIRCLE))) == 528
 
 
+@pytest.mark.parametrize("compact", [True, False])
+def test_points_that_agents_of_a_process_share_can_not_be_changed(compact: bool) -> None:
+    payload = encode_path(path(CIRCLE), compact=compact)
+    one, other = decode_path(payload), decode_path(payload)
+    assert one is other and one is not None
+    with pytest.raises(ValueError, match="read-only"):
+        one.pos_ned_m[0] = 0.0
+
+
 def test_all_but_points_and_margin_are_sent_as_they_are() -> None:
     decoded = sent(CIRCLE)
     assert (decoded.agent, decoded.boot_id, decoded.seq) == (4, 7, 9)
