@@ -32,7 +32,7 @@ class VouchedEnds:
         known = self._is_down.setdefault(ended.agent, {})
         if known.get(ended.boot_id) is ended.is_down:
             return None, ""
-        if len(known) == _MOST_PROCESSES:
+        if ended.boot_id not in known and len(known) >= _MOST_PROCESSES:
             return None, SEQUENCE
         known.pop(ended.boot_id, None)
         known[ended.boot_id] = ended.is_down

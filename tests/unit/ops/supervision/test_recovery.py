@@ -1,0 +1,113 @@
+"""Whose vehicle counts as down when its agent ends, whose is recovered, and whose is named as left."""
+
+from __future__ import annotations
+
+import signal
+import time
+from typing import cast
+
+import pytest
+
+from swarmctl.core.types import Phase
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
+from swarmctl.ops.processes import Child
+from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery
+from swarmctl.ops.supervision.status_table import AgentView
+from tests import builders
+
+KILLED = 128 + signal.SIGKILL
+CHILD = cast(Child, object())
+
+
+def seen(phase: Phase = Phase.TRACK, agent: int = 1) -> AgentView:
+    return AgentView(agent=agent, status=builders.status_message(agent=agent, phase=phase))
+
+
+def recovering() -> tuple[Recovery, AgentView]:
+    found, view = Recovery(lambda _: CHILD, (1, 2, 3)), seen()
+    assert found.begin(view, KILLED) is CHILD
+    return found, view
+
+
+@pytest.mark.parametrize("code", [EXIT_MISSION, KILLED, 1])
+@pytest.mark.parametrize("phase", [phase for phase in Phase if phase is not Phase.DONE])
+def test_the_vehicle_of_an_agent_that_dies_before_it_is_done_is_recovered(phase: Phase, code: int) -> None:
+    """In any phase: an autopilot may be armed by a pilot, or before the agent has told of it."""
+    started: list[int] = []
+
+    def start(agent: int) -> Child:
+        started.append(agent)
+        return CHILD
+
+    found = Recovery(start, (1, 2, 3))
+    assert not found.leaves_down(seen(phase), code)
+    assert found.begin(seen(phase), code) is CHILD
+    assert started == [1] and found.is_on(1) and not found.is_on(0)
+    assert found.left([seen(phase)]) == []
+
+
+@pytest.mark.parametrize("code", [EXIT_OK, EXIT_INTERRUPTED, EXIT_START])
+def test_an_agent_that_ends_so_leaves_its_vehicle_down(code: int) -> None:
+    found = Recovery(lambda _: CHILD, (1, 2, 3))
+    assert found.leaves_down(seen(), code)
+    assert found.begin(seen(), code) is None
+    assert not found.is_on(1) and found.left([seen()]) == []
+
+
+def test_an_agent_that_was_done_leaves_its_vehicle_down_however_it_ends() -> None:
+    assert Recovery(lambda _: CHILD, (1, 2, 3)).leaves_down(seen(Phase.DONE), KILLED)
+
+
+def test_of_an_agent_that_was_never_heard_nothing_is_recovered_and_nothing_claimed() -> None:
+    found, view = Recovery(lambda _: CHILD, (1, 2, 3)), AgentView(agent=1)
+    assert not found.leaves_down(view, KILLED)
+    assert found.begin(view, KILLED) is None
+    assert found.left([view]) == []
+
+
+@pytest.mark.parametrize("code", [EXIT_START, EXIT_MISSION, KILLED])
+def test_a_vehicle_whose_recovery_fails_is_named_and_not_recovered_again(code: int) -> None:
+    """One that could not start has found the vehicle's link taken, or no vehicle: it may be in the air."""
+    found, view = recovering()
+    assert not found.leaves_down(view, code)
+    assert found.begin(view, code) is None
+    [words] = found.left([view, seen(agent=2)])
+    assert words.startswith("vehicle 2 (agent-1) may be armed or in the air")
+
+
+def test_a_vehicle_that_was_recovered_is_not_named() -> None:
+    found, view = recovering()
+    assert found.begin(view, EXIT_INTERRUPTED) is None
+    assert found.left([view]) == []
+
+
+def test_a_recovery_that_can_not_be_started_leaves_the_vehicle_named() -> None:
+    def refuses(_: int) -> Child:
+        raise StartError("no such program")
+
+    found, view = Recovery(refuses, (1, 2, 3)), seen()
+    with pytest.raises(StartError):
+        found.begin(view, KILLED)
+    assert len(found.left([view])) == 1
+
+
+def test_a_recovery_is_overdue_after_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    found, view = recovering()
+    now_s += RECOVERY_S - 0.1
+    assert not found.is_overdue(view.agent)
+    now_s += 0.2
+    assert found.is_overdue(view.agent) and not found.is_overdue(0)
+
+
+def test_of_agents_that_are_killed_in_flight_the_vehicles_are_named() -> None:
+    found = Recovery(lambda _: CHILD, (1, 2, 3, 4))
+    views = [
+        seen(Phase.STANDBY, 0),
+        seen(Phase.ARM, 1),
+        seen(Phase.LAND, 2),
+        seen(Phase.DONE, 3),
+    ]
+    found.give_up([*views, AgentView(agent=3)])
+    assert [words.split()[1] for words in found.left(views)] == ["2", "3"]
