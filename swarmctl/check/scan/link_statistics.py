@@ -11,6 +11,7 @@ import numpy as np
 from swarmctl.check.scan.link_facts import RoundTrip, VehicleTime
 
 _REORDERED = 128  # a sequence number this far behind belongs to a late frame, not to a gap
+_REMEMBERED = (1 << _REORDERED + 1) - 1  # of the newest sequence number, and those that far behind
 _CLOCK_ANSWERS, _CLOCK_SPAN_S = 8, 0.8  # fewer answers or a shorter span give no drift
 
 
@@ -31,6 +32,7 @@ class FrameStatistics:
         self.bytes = 0
         self.lost = 0
         self._last_seq: int | None = None
+        self._come = 0  # a bit for each sequence number that has come, the newest in the lowest
         self._count: Counter[str] = Counter()
         self._first_us: dict[str, int] = {}
         self._last_us: dict[str, int] = {}
@@ -39,14 +41,15 @@ class FrameStatistics:
         """Count a frame with a valid checksum or of unknown type: both take a sequence number."""
         self.frames += 1
         self.bytes += size
-        if self._last_seq is not None:
-            ahead = (seq - self._last_seq) % 256
-            if 0 < ahead < _REORDERED:
-                self.lost += ahead - 1
-            else:  # late or duplicate: a late one was counted as lost before
-                self.lost = max(0, self.lost - 1)
-                return
-        self._last_seq = seq
+        ahead = 1 if self._last_seq is None else (seq - self._last_seq) % 256
+        if 0 < ahead < _REORDERED:
+            self.lost += ahead - 1
+            self._last_seq, self._come = seq, (self._come << ahead | 1) & _REMEMBERED
+            return
+        late = 1 << -ahead % 256
+        if not self._come & late:  # else it has come twice, as where two ways lead here
+            self.lost = max(0, self.lost - 1)  # counted before
+            self._come |= late
 
     def message(self, name: str, t_us: int) -> None:
         self._count[name] += 1

@@ -397,6 +397,10 @@ def test_nothing_may_be_changed_on_a_vehicle_that_is_armed_silent_or_another(
         ([254, 255, 0, 1], 0),
         ([0, 1, 3, 2, 4], 0),
         ([0, 1, 1, 2], 0),
+        ([0, 0, 2, 2, 4, 4], 2),
+        ([0, 2, 0, 4, 2, 6, 4], 3),
+        ([0, 3, 1, 1, 1, 4], 1),
+        ([200, 255, 200, 200, 255], 54),
     ],
 )
 def test_lost_frames(seqs: Sequence[int], lost: int) -> None:
