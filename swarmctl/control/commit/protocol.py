@@ -220,6 +220,8 @@ class Commitments:
             self._compatible, self._compatible_with = {}, self.committed
         new = [t for t in commitments.values() if id(t) not in self._compatible]
         if new and not self._planner.conflicts(self.committed, utc_us, list(map(by_exact_clock, new))):
+            told = {id(t) for message in peers.values() for t in message.trajectories}
+            self._compatible = {key: t for key, t in self._compatible.items() if key in told}  # the others are past
             self._compatible.update((id(t), t) for t in new)
             new = []
         unsure = {agent: t for agent, t in commitments.items() if any(t is other for other in new)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Sequence
 
 import numpy as np
@@ -64,6 +65,20 @@ def test_an_evasion_is_found_by_the_peer_it_conflicts_with() -> None:
     assert first.counts.evasive == 1, "before a wall there is no time for acknowledgements"
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}, "as long as it does"
+
+
+DT_US = 70_000  # of nobody else's trajectories
+
+
+def test_who_rests_forgets_what_its_peers_do_not_fly_any_more() -> None:
+    """An agent that is hemmed in for minutes hears ten commitments a second of each of its peers."""
+    agent, peer = meeting()
+    agent.end(np.array([0.0, 30.0, -2.0]), UTC_US)
+    for k in range(200):
+        peer.committed = resting(np.array([0.01 * k, 0.0, -2.0]), UTC_US + 100_000 * k, DT_US)
+        assert agent.conflicting_peers(UTC_US + 100_000 * k, message_of(peer, 1)) == set()
+    kept = [found for found in gc.get_objects() if isinstance(found, Trajectory) and found.dt_us == DT_US]
+    assert len(kept) <= 2
 
 
 def test_a_wall_that_leaves_time_for_acknowledgements_triggers_no_evasion() -> None:
