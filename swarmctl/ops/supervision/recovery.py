@@ -53,7 +53,6 @@ class Recovery:
             StartError, OSError: it can't be started; the vehicle counts as lost.
         """
         if self.leaves_down(view, code):
-            self._lost.discard(view.agent)
             return None
         if self.is_on(view.agent) or view.status is None:
             self._lost |= {view.agent} if view.status is not None else set()
@@ -76,8 +75,7 @@ class Recovery:
 
     def _words(self, view: AgentView) -> str:
         status = view.status
-        if status is None:
-            return f"vehicle {self._sysids[view.agent]}: nothing is known of it"
+        assert status is not None  # of who was never heard nothing is claimed
         armed = "armed" if status.armed else "not yet told to be armed"
         return (
             f"vehicle {self._sysids[view.agent]} (agent-{view.agent}) may be armed or in the air: it was {armed}, in "

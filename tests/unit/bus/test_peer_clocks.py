@@ -63,7 +63,9 @@ def test_a_drifting_clock_is_followed() -> None:
     pair = Pair(300_000, drift_ppm=200.0)
     for _ in range(3000):
         pair.exchange(20_000, 20_000)
-        assert abs(pair.clocks.ahead_us(1) - pair.true_us) <= 45_000
+        off_us = abs(pair.clocks.ahead_us(1) - pair.true_us)
+        assert off_us <= 45_000
+        assert off_us <= pair.clocks.error_us(1) + 2_000, "distances leave room for the error that is told"
     assert pair.true_us > 300_000 + 20_000
 
 
@@ -73,6 +75,7 @@ def test_a_clock_that_is_set_is_followed_at_once() -> None:
         pair.exchange(20_000, 20_000)
     pair.ahead_us = -3 * SECOND_US
     pair.exchange(20_000, 20_000)
+    assert pair.clocks.ahead_us(1) == 0, "its answer alone tells no lower bound, and an interval without one no middle"
     pair.exchange(20_000, 20_000)
     assert abs(pair.clocks.ahead_us(1) - pair.ahead_us) <= 40_000
 

@@ -6,6 +6,7 @@ import signal
 import time
 from typing import cast
 
+import msgspec
 import pytest
 
 from swarmctl.core.types import Phase
@@ -73,6 +74,15 @@ def test_a_vehicle_whose_recovery_fails_is_named_and_not_recovered_again(code: i
     assert found.begin(view, code) is None
     [words] = found.left([view, seen(agent=2)])
     assert words.startswith("vehicle 2 (agent-1) may be armed or in the air")
+
+
+@pytest.mark.parametrize(("armed", "words"), [(True, "it was armed, in TRACK"), (False, "not yet told to be armed")])
+def test_what_was_heard_last_of_a_vehicle_that_is_left_is_told(armed: bool, words: str) -> None:
+    found, view = recovering()
+    assert view.status is not None
+    view.status = msgspec.structs.replace(view.status, armed=armed)
+    found.begin(view, KILLED)
+    assert words in found.left([view])[0]
 
 
 def test_a_vehicle_that_was_recovered_is_not_named() -> None:
