@@ -127,6 +127,7 @@ def test_neither_an_order_from_another_time_nor_one_without_a_number_is_answered
     assert agent.obeys("hold", NOW_US)
     agent.orders.answer(Order("hold"), "")
     assert not agent.obeys("hold", NOW_US)
+    assert not agent.obeys("rtl", NOW_US - 1), "superseded"
     assert agent.orders.due_answers() == []
 
 

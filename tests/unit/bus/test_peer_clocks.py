@@ -139,3 +139,12 @@ def test_a_clock_that_is_too_far_ahead_is_told_with_how_far_until_it_is_believed
     assert clocks.alert.startswith("clock of agent-2 is 11.00 s ahead of this one")
     clocks.received(2, 101_000_000, 101_000_000)
     assert clocks.alert == ""
+
+
+def test_of_several_clocks_that_are_off_the_farthest_is_told() -> None:
+    clocks = PeerClocks([1, 2, 3], lambda *_, **__: None)
+    for agent, ahead_us in ((1, 100_000), (2, -700_000), (3, 0)):
+        clocks.received(agent, UTC_US + ahead_us, UTC_US)
+        clocks.answered(agent, UTC_US, UTC_US + ahead_us, UTC_US)
+        farthest = "agent-1 is 0.10 s ahead" if agent == 1 else "agent-2 is 0.70 s behind"
+        assert clocks.alert.startswith(f"clock of {farthest}")

@@ -54,6 +54,7 @@ def test_newest_path_of_every_peer_is_kept_by_agent_number() -> None:
     store = Store()
     store.offer(payload(agent=2, seq=4), "agent-2")
     store.offer(payload(agent=1, seq=1))
+    assert store.kept == [(1, 7, 1), (2, 7, 4)]
     store.offer(payload(agent=1, seq=2))
     assert store.kept == [(1, 7, 2), (2, 7, 4)]
     assert not store.refusals.total
@@ -70,6 +71,45 @@ def test_a_path_gets_room_for_the_error_of_its_clock() -> None:
     clocks.answered(1, NOW_US, NOW_US + 30_000, NOW_US + 40_000)
     store.offer(encode_path(replace(path, seq=2)))
     assert store.paths.latest()[0].margin_m == pytest.approx(path.margin_m + 0.03 * 2.5, rel=1e-3)
+
+
+def test_that_room_is_for_where_the_peer_is_fastest() -> None:
+    store, clocks = Store(), PeerClocks([1, 2], lambda *_, **__: None)
+    store.paths = PeerPaths([1, 2], 50.0, store.refusals, store.presence, clocks=clocks)
+    clocks.received(1, NOW_US, NOW_US + 30_000)
+    clocks.answered(1, NOW_US, NOW_US + 30_000, NOW_US + 40_000)
+    braking = np.array([[x_m, 0.0, 0.0] for x_m in (0.0, 0.06, 0.10, 0.12, 0.12)])  # from 3 m/s
+    path = builders.predicted_path(agent=1, seq=1, t0_utc_us=NOW_US, dt_us=20_000, pos_ned_m=braking)
+    store.offer(encode_path(path))
+    assert store.paths.latest()[0].margin_m == pytest.approx(path.margin_m + 0.03 * 3.0, rel=1e-3)
+
+
+def test_a_path_is_taken_at_times_of_the_own_clock_where_the_peer_s_is_known_exactly() -> None:
+    store, clocks = Store(), PeerClocks([1, 2], lambda *_, **__: None)
+    store.paths = PeerPaths([1, 2], 50.0, store.refusals, store.presence, clocks=clocks)
+    clocks.received(1, NOW_US + 3_000_000, NOW_US)
+    clocks.answered(1, NOW_US, NOW_US + 3_000_000, NOW_US)
+    store.offer(payload(t0_utc_us=NOW_US + 3_000_000))
+    assert [path.t0_utc_us for path in store.paths.latest()] == [NOW_US]
+
+
+def test_those_within_reach_are_near_from_when_they_came_and_the_others_stay_known() -> None:
+    store = store_with(payload())
+    store.offer(payload(agent=2), "agent-2")
+    paths, later_us = store.paths, NOW_US + 1_000_000
+    assert [path.agent for path in paths.near()] == [1, 2] and paths.is_near(1), "at first everybody"
+    paths.attend([2], NOW_US)
+    assert [path.agent for path in paths.near()] == [2]
+    assert (paths.is_near(1), paths.is_near(2)) == (False, True)
+    assert len(paths.latest()) == 2 and paths.newest_utc_us(1) == NOW_US
+    paths.attend([1, 2], later_us)
+    assert [path.agent for path in paths.near()] == [1, 2]
+    assert [path.agent for path in paths.near(later_us - 1)] == [2]
+    assert [path.agent for path in paths.late(later_us)] == [1, 2]
+    assert [path.agent for path in paths.late(later_us - 1)] == [2], "who has just come was not listened to before"
+    assert paths.late(NOW_US) == []
+    paths.attend([9], later_us)
+    assert paths.is_near(9) and paths.newest_utc_us(9) == 0, "within reach, and not heard yet"
 
 
 def test_the_path_of_a_stale_peer_is_kept() -> None:

@@ -197,12 +197,29 @@ def test_who_lands_the_vehicle_of_another_agent_is_told_what_its_parameters_were
         (LaunchResult(landed_by_operator=True, interrupted=True), True, 130),
         (LaunchResult(interrupted=True, left=("vehicle 1",)), False, 4),
         (LaunchResult(could_not_start=True), True, 3),
+        (LaunchResult(could_not_start=True, has_armed=True, problems=["agent-1 could not start"]), False, 4),
+        (LaunchResult(landed_by_operator=True, problems=["agent-1 died"]), False, 4),
+        (LaunchResult(problems=["agent-1 died"]), False, 4),
     ],
 )
 def test_a_violation_is_told_by_the_exit_code_unless_ctrl_c_has_ended_the_flight(
     result: LaunchResult, violated: bool, code: int
 ) -> None:
     assert result.exit_code(violated) == code
+
+
+@pytest.mark.parametrize(
+    ("result", "outcome"),
+    [
+        (LaunchResult(), "completed"),
+        (LaunchResult(problems=["agent-1 died"]), "failed"),
+        (LaunchResult(problems=["agent-1 died"], landed_by_operator=True), "failed"),
+        (LaunchResult(landed_by_operator=True), "interrupted"),
+        (LaunchResult(problems=["not landed"], interrupted=True), "interrupted"),
+    ],
+)
+def test_a_flight_has_failed_by_what_went_wrong_whoever_has_landed_the_rest(result: LaunchResult, outcome: str) -> None:
+    assert result.outcome == outcome
 
 
 def test_a_launch_tells_verbs_its_clock_again_where_it_was_corrected(
