@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import re
 from pathlib import Path
 
@@ -54,6 +55,32 @@ def test_commitments_leave_room_for_tracking_however_large_the_slack_is() -> Non
     assert budget.committed_m == pytest.approx(0.85)
     assert budget.tube_m == pytest.approx(0.1)
     assert SeparationParams(radius_m=0.5, body_m=0.6).budget.committed_m == 0.5, "there is none to use up"
+
+
+@pytest.mark.parametrize("slack_m", [0.02, 0.1, 5.0])
+@pytest.mark.parametrize("committed_m", [0.7, 0.9, 2.0])
+def test_the_radius_that_commits_a_distance_is_the_least_that_does(committed_m: float, slack_m: float) -> None:
+    params = SeparationParams(body_m=0.48, certify_slack_m=slack_m)
+    radius_m = params.budget.radius_that_commits_m(committed_m)
+    assert params.model_copy(update={"radius_m": radius_m}).budget.committed_m == pytest.approx(committed_m)
+    assert params.model_copy(update={"radius_m": radius_m - 0.01}).budget.committed_m < committed_m - 0.005
+
+
+@pytest.mark.parametrize("accuracy_m", [0.0, 0.05, 0.2, 0.5])
+def test_who_stands_a_radius_apart_is_not_waited_for_and_who_touches_is(accuracy_m: float) -> None:
+    """By estimates that are off by twice the rms of their difference, two that stand apart seem that much closer."""
+    budget = SeparationParams(radius_m=2.0, body_m=0.48, tracking_m=0.05).budget
+    error_m = 2.0 * math.sqrt(2.0) * accuracy_m
+    assert budget.standing_m(accuracy_m) <= budget.radius_m - budget.certify_slack_m - error_m + 1e-9
+    assert budget.standing_m(accuracy_m) <= budget.required_m(accuracy_m), "more than a radius needs is not asked for"
+    if accuracy_m <= 0.2:
+        assert budget.standing_m(accuracy_m) - error_m >= 0.53 - 1e-9, "bodies that stand so far apart do not touch"
+
+
+def test_a_vehicle_lands_at_home_beside_one_whose_estimate_has_wandered_but_not_onto_it() -> None:
+    """Starts are a radius apart; a third of that may be lost on the way."""
+    assert SeparationParams(radius_m=1.5, body_m=0.48, tracking_m=0.05).budget.home_m == pytest.approx(1.0)
+    assert SeparationParams(radius_m=0.6, body_m=0.48, tracking_m=0.05).budget.home_m == pytest.approx(0.53)
 
 
 def test_margins_of_a_peer_add_up_in_every_layer() -> None:

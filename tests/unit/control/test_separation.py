@@ -13,7 +13,9 @@ from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import (
     SeparationParams,
     align,
+    aligned,
     certify,
+    keep_out_along,
     keep_out_of_obstacle,
     keep_out_of_peer,
     radius_problem,
@@ -28,21 +30,48 @@ from tests.benches.keep_outs import DT_US, PARAMS, STEPS, UTC_US, fixed, line, p
 
 def test_alignment_interpolates_between_points() -> None:
     curve = peer(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, -1.0], [3.0, 2.0, -1.0], [3.0, 6.0, -1.0]]))
-    aligned = align(curve, UTC_US + 25_000, 50_000, 3, brake_m_s2=3.0)
-    np.testing.assert_allclose(aligned, [[0.25, 0.0, -0.25], [0.75, 0.0, -0.75], [1.5, 0.5, -1.0], [2.5, 1.5, -1.0]])
+    found = align(curve, UTC_US + 25_000, 50_000, 3, brake_m_s2=3.0)
+    np.testing.assert_allclose(found, [[0.25, 0.0, -0.25], [0.75, 0.0, -0.75], [1.5, 0.5, -1.0], [2.5, 1.5, -1.0]])
 
 
 def test_alignment_before_the_first_point_goes_back_along_the_first_segment() -> None:
-    aligned = align(straight(2.0), UTC_US - 150_000, DT_US, 2, brake_m_s2=3.0)
-    np.testing.assert_allclose(aligned[:, 0], [-0.3, -0.1, 0.1], atol=1e-12)
+    found = align(straight(2.0), UTC_US - 150_000, DT_US, 2, brake_m_s2=3.0)
+    np.testing.assert_allclose(found[:, 0], [-0.3, -0.1, 0.1], atol=1e-12)
 
 
 def test_beyond_its_end_a_peer_brakes_to_a_stop() -> None:
     # 3 m/s at the end (x = 1.5 at 0.5 s), brake 3 m/s2: stops 1 s later 1.5 m on
-    aligned = align(straight(3.0), UTC_US + 500_000, 250_000, 6, brake_m_s2=3.0)
+    found = align(straight(3.0), UTC_US + 500_000, 250_000, 6, brake_m_s2=3.0)
     # 3 t - 1.5 t^2 at 0, .25, .5, .75, 1 s: 0, .65625, 1.125, 1.40625, 1.5, then at rest
-    np.testing.assert_allclose(aligned[:, 0], [1.5, 2.15625, 2.625, 2.90625, 3.0, 3.0, 3.0], atol=1e-12)
-    np.testing.assert_allclose(aligned[:, 2], -2.0)
+    np.testing.assert_allclose(found[:, 0], [1.5, 2.15625, 2.625, 2.90625, 3.0, 3.0, 3.0], atol=1e-12)
+    np.testing.assert_allclose(found[:, 2], -2.0)
+
+
+def test_a_path_that_has_just_ended_is_continued_at_every_time() -> None:
+    """The peer has braked since the end of its path, before the first time that is asked for."""
+    late_s = np.array([0.15, 0.25, 0.35, 0.45])
+    found = align(straight(3.0), UTC_US + 650_000, DT_US, 3, brake_m_s2=3.0)
+    np.testing.assert_allclose(found[:, 0], 1.5 + 3.0 * late_s - 1.5 * late_s**2, atol=1e-12)
+
+
+def test_several_peers_are_where_each_alone_would_be() -> None:
+    rng = np.random.default_rng(3)
+    paths = [
+        replace(
+            peer(np.cumsum(rng.normal(scale=0.1, size=(count, 3)), axis=0), dt_us),
+            t0_utc_us=UTC_US + since_us,
+        )
+        for count, dt_us, since_us in (
+            (6, 100_000, 0),
+            (40, 50_000, -80_000),
+            (3, 100_000, -900_000),
+            (9, 20_000, 70_000),
+        )
+    ]
+    for some in (paths, paths[1:2], paths[2:3], paths[:2]):
+        found = aligned(some, UTC_US, 25_000, 30, brake_m_s2=3.0)
+        alone = [align(path, UTC_US, 25_000, 30, brake_m_s2=3.0) for path in some]
+        np.testing.assert_allclose(found, alone, atol=1e-12)
 
 
 def test_without_setpoints_the_first_level_acceleration_goes_on_and_then_it_brakes() -> None:
@@ -84,13 +113,13 @@ def test_without_setpoints_no_more_acceleration_is_kept_than_a_vehicle_has(point
 
 
 def test_a_path_one_hour_old_has_stopped() -> None:
-    aligned = align(straight(3.0), UTC_US + 3_600_000_000, DT_US, 2, brake_m_s2=3.0)
-    np.testing.assert_allclose(aligned[:, 0], 3.0)
+    found = align(straight(3.0), UTC_US + 3_600_000_000, DT_US, 2, brake_m_s2=3.0)
+    np.testing.assert_allclose(found[:, 0], 3.0)
 
 
 def test_a_path_at_rest_is_not_extrapolated() -> None:
-    aligned = align(straight(0.0), UTC_US + 10_000_000, DT_US, 2, brake_m_s2=3.0)
-    np.testing.assert_allclose(aligned, np.tile([0.0, 0.0, -2.0], (3, 1)))
+    found = align(straight(0.0), UTC_US + 10_000_000, DT_US, 2, brake_m_s2=3.0)
+    np.testing.assert_allclose(found, np.tile([0.0, 0.0, -2.0], (3, 1)))
 
 
 @pytest.mark.parametrize(
@@ -106,6 +135,37 @@ def test_keep_out_grows_with_age_to_its_cap_and_a_lost_peer_is_a_cylinder(
     assert keep_out.radius_m == pytest.approx(0.9 + 0.25 + margin_m)
     assert keep_out.hard_min_distance_m == pytest.approx(0.9 + 0.25 - 0.1)
     assert (keep_out.any_height, keep_out.priority_id) == (any_height, 4)
+
+
+@pytest.mark.parametrize(
+    ("age_s", "north_m", "radius_m"),
+    [
+        (9.0, 5.0, 2.15),  # all of the margin of age fits in between
+        (9.0, 1.6, 1.6),
+        (9.0, 0.5, 1.15),  # closer than is kept from the path itself
+        (0.5, 0.5, 1.65),  # a path that is not that old is not a silent peer's
+    ],
+)
+def test_a_silent_peer_is_not_approached_and_drives_nobody_away(age_s: float, north_m: float, radius_m: float) -> None:
+    path = peer(np.zeros((3, 3)), radius_m=0.25)
+    found = keep_out_along(
+        path,
+        np.zeros((STEPS + 1, 3)),
+        UTC_US + round(age_s * 1e6),
+        PARAMS,
+        PARAMS.budget,
+        parked=False,
+        landing=False,
+        here_ned_m=np.array([north_m, 0.0, -30.0]),  # level distances count: it may be at any height
+    )
+    assert found.radius_m == pytest.approx(radius_m)
+    assert found.hard_min_distance_m == pytest.approx(1.05)
+
+
+def test_the_distance_of_what_holds_at_every_height_is_level() -> None:
+    here = np.array([3.0, 4.0, -12.0])
+    assert fixed((0.0, 0.0, 0.0), 0.8, any_height=True).distance_m(here) == pytest.approx(5.0)
+    assert fixed((0.0, 0.0, 0.0), 0.8).distance_m(here) == pytest.approx(13.0)
 
 
 def test_the_keep_out_of_a_landed_peer_does_not_grow() -> None:
@@ -261,6 +321,12 @@ def test_gusts_raise_the_radius_that_is_required() -> None:
     assert radius_problem(params, 0.0, 0.0) == ""
     problem = radius_problem(params, 0.0, 1.0)
     assert all(part in problem for part in ("gusts of 8 m/s, each 1.00 m,", "need 2.48 m"))
+
+
+def test_a_wind_in_which_no_vehicle_can_stand_is_refused_in_other_words_than_a_radius() -> None:
+    problem = radius_problem(SeparationParams(gust_m_s=30.0), 0.0, math.inf)
+    assert problem.startswith("separation.gust_m_s = 30: no radius suffices")
+    assert "inf" not in problem
 
 
 def test_plans_keep_the_tracking_error_on_top_and_the_certificate_does_not() -> None:
