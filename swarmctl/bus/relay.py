@@ -29,13 +29,15 @@ Relayed = list[tuple[int, bytes]]  # numbers of agents, and what they have sent
 
 
 def encode_relay(messages: Sequence[tuple[int, bytes]]) -> bytes:
-    """Encode the messages of some agents, the first ones if they are too many or too long."""
-    parts, length = list[bytes](), _HEADER.size
+    """Encode the messages of some agents, the first ones if they are too many; what there is no room for is left out.
+
+    The next ones may be short enough: no agent keeps those of others from being passed on by the length of its own.
+    """
+    parts, room = list[bytes](), RELAY.max_bytes - _HEADER.size
     for agent, payload in messages[:255]:
-        length += _ENTRY.size + len(payload)
-        if length > RELAY.max_bytes:
-            break
-        parts.append(_ENTRY.pack(agent, len(payload)) + payload)
+        if _ENTRY.size + len(payload) <= room:
+            room -= _ENTRY.size + len(payload)
+            parts.append(_ENTRY.pack(agent, len(payload)) + payload)
     return _HEADER.pack(_MAGIC, RELAY_VERSION, len(parts)) + b"".join(parts)
 
 

@@ -283,6 +283,17 @@ def test_a_body_that_names_no_topic_is_refused(body: bytes) -> None:
     assert net.at["bravo"].refused == Counter({MALFORMED: 1})
 
 
+@pytest.mark.parametrize("relayed", [False, True])
+def test_what_is_shorter_than_any_body_is_refused_and_does_not_count_as_heard(relayed: bool) -> None:
+    net = Net()
+    net.beat()
+    net.now_s += HEARD_S
+    short = net.at["alpha"]._links[1].channel.seal(b"\x01", relayed=relayed)
+    assert net.at["bravo"].take(short, ADDRESSES["alpha"], net.now_s).messages == ()
+    assert net.at["bravo"].refused == Counter({MALFORMED: 1})
+    assert net.at["bravo"]._mask(net.now_s) == 0
+
+
 def test_a_stranger_s_datagrams_are_counted_and_passed_on_to_nobody() -> None:
     net = Net()
     net.beat()

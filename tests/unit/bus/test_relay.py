@@ -32,6 +32,14 @@ def test_a_relay_never_exceeds_the_length_of_its_topic() -> None:
     assert decode_relay(payload) == many[:2]
 
 
+def test_one_message_that_is_too_long_to_be_relayed_holds_up_no_other() -> None:
+    """A trajectory message may be twice as long as what a relay carries."""
+    long, fits = bytes(RELAY.max_bytes), bytes(RELAY.max_bytes - 12)
+    assert decode_relay(encode_relay([(1, long), *MESSAGES])) == MESSAGES
+    assert decode_relay(encode_relay([(1, fits), *MESSAGES])) == [(1, fits)], "to the last byte"
+    assert decode_relay(encode_relay([(1, fits + b"\0"), *MESSAGES])) == MESSAGES
+
+
 @pytest.mark.parametrize(
     "payload",
     [
