@@ -191,6 +191,25 @@ def test_a_third_computer_passes_on_what_a_cut_link_does_not_carry(relay: bool, 
     assert len(net.sent) == 3, "directly again"
 
 
+@pytest.mark.parametrize(
+    "lost_with", [{"alpha"}, {"bravo"}, {"alpha", "bravo", STATION}], ids=["is not heard", "hears it not", "has ended"]
+)
+def test_of_several_that_could_pass_it_on_one_that_can_is_asked(lost_with: set[str]) -> None:
+    """Charlie, which is first in the list, has lost its link to one of both ends, or is gone; the station is not."""
+    net = Net()
+    net.beat()
+    net.loses = lambda a, b: {a, b} == {"alpha", "bravo"} or ("charlie" in (a, b) and bool({a, b} & lost_with))
+    net.beat(round(2 * HEARD_S / BEAT_S))
+    assert net.say("alpha", PATH.format(0))["bravo"] == 1
+
+
+def test_a_recorded_greeting_is_answered_where_the_host_is_configured_to_be() -> None:
+    net = Net()
+    [greeting] = [datagram for datagram, to in net.at["alpha"].beat(net.now_s) if to == ADDRESSES["bravo"]]
+    taken = net.at["bravo"].take(greeting, ("10.0.0.66", 7449), net.now_s)
+    assert [to for _, to in taken.outgoing] == [ADDRESSES["alpha"]]
+
+
 @pytest.mark.parametrize("relay", [True, False])
 def test_two_that_have_never_heard_each_other_meet_by_a_third_one(relay: bool) -> None:
     net = Net(relay=relay)
@@ -274,7 +293,9 @@ def test_half_of_all_datagrams_lost_leaves_half_of_the_messages() -> None:
     assert 150 < arrived["bravo"] < 250
 
 
-@pytest.mark.parametrize("body", [b"", b"\xff", b"\x10run/agent-0/pat", b"\x10r\xfcn/agent-0/path", b"\x05a/b/c"])
+@pytest.mark.parametrize(
+    "body", [b"", b"\xff", b"\x10run/agent-0/pat", b"\x10r\xfcn/agent-0/path", b"\x05a/b/c", b"\xffrun/agent-0/path"]
+)
 def test_a_body_that_names_no_topic_is_refused(body: bytes) -> None:
     net = Net()
     net.beat()
