@@ -120,6 +120,7 @@ def make_world_model(setup: AgentSetup, ports: Ports) -> WorldModel:
         vouchers=setup.vouchers,
         quorum=setup.quorum,
         model=setup.vehicle_model,
+        loss_s=lambda: (ports.autopilot.setpoint_loss_s, ports.autopilot.landing_delay_s),
     )
 
 

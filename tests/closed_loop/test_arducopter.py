@@ -9,8 +9,10 @@ import pytest
 
 from sitl.arducopter.autopilot import ArduCopter
 from sitl.lockstep import Lockstep
-from swarmctl.core.types import FlightMode, Landed, Mode, Phase
-from tests.closed_loop.conftest import Flight, fly_now
+from swarmctl.agent.sensing import world_model
+from swarmctl.control.collision.separation import without_setpoints
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
+from tests.closed_loop.conftest import Flight, fly_now, mission_t_s
 
 CONFIG = "ardupilot_sitl.toml"
 
@@ -78,3 +80,40 @@ def test_negative_control_without_its_failsafe_it_would_never_be_armed() -> None
     (agent,) = flight.lockstep.agents
     assert agent is not None and "FS_GCS_ENABLE" in agent.outcome
     assert not flight.lockstep.truth["armed"].any()
+
+
+# Committed to crossing each other's ways one after another.
+CROSSING = (
+    *("agent.rate_hz=25", "sitl.start=air", "swarm.agents=3", "separation.mode=guaranteed"),
+    "start.positions_ned_m=[[2.5862,1.5048,-3],[-2.5752,1.4846,-3],[-0.0358,-3.002,-3]]",
+    *("mission.kind=swap", "mission.swap.travel_s=6", "mission.duration_s=60"),
+)
+ENDS_AT_S, PASSED_S = 0.7, 4.2
+
+
+def without_an_agent(seed: int = 0) -> float:
+    """Return how close vehicles come when an agent ends, of which the others are told; its own flies on for 2 s."""
+    flight = fly_now(
+        *CROSSING,
+        config=CONFIG,
+        at={ENDS_AT_S: lambda running: running.kill(1)},
+        until=lambda running: mission_t_s(running) > PASSED_S,
+        seed=seed,
+    )
+    return flight.separation_m()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_others_keep_clear_of_one_whose_agent_has_ended_as_long_as_it_flies_on(seed: int) -> None:
+    assert without_an_agent(seed) >= 0.85
+
+
+@pytest.mark.usefixtures("configured_starts")
+def test_negative_control_one_that_is_expected_to_brake_as_soon_as_a_px4_is_hit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def as_a_px4(path: PredictedPath, *, lag_s: float, drag_1_s: float, **_: float) -> PredictedPath:
+        return without_setpoints(path, lag_s=lag_s, drag_1_s=drag_1_s)
+
+    monkeypatch.setattr(world_model, "without_setpoints", as_a_px4)
+    assert without_an_agent() < 0.48, "bodies touch"

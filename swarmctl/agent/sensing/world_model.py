@@ -49,6 +49,8 @@ class WorldModel:
         vouchers: agents of which each sender may say that they have ended.
         quorum: see `AgentSetup`.
         model: of the own vehicle; those of peers are taken for such ones.
+        loss_s: how long the own autopilot keeps the attitude without setpoints, and when it brakes if it hears nothing
+            at all; None until it has told. Those of peers are taken for such ones, too.
         note: receives the events `refused` (see `Refusals`), `obstacles_changed` with the list as it was received,
             `peer_ended` with the process that has, and `unresponsive`: a peer within reach is on the bus and has
             published no accepted path for `lost_after_s`; also when that ends, with its duration.
@@ -70,10 +72,11 @@ class WorldModel:
         vouchers: Mapping[str, Set[int]],
         quorum: int,
         model: VehicleModelParams,
+        loss_s: Callable[[], tuple[float | None, float | None]] = lambda: (None, None),
     ) -> None:
         self._agent, self._params, self._bus, self._note = agent, params, bus, note
         self._peers, self._quorum, self._utc_us = peers, quorum, utc_us
-        self._ends_as = {"lag_s": model.lag_s, "drag_1_s": model.drag_1_s}
+        self._model, self._loss_s = model, loss_s
         self._budget = params.budget
         self.refusals, self.presence = Refusals(note), Presence(bus)
         self.clocks = PeerClocks(peers, note, trusts_equal=params.mode == "best_effort")
@@ -255,11 +258,16 @@ class WorldModel:
         if boot_id == path.boot_id and not self.statuses.flies_itself(agent):
             return (path,)  # as its autopilot or a pilot flies it
         if self.statuses.process_has_ended(agent, path.boot_id):  # whatever a process says that was started after it
-            return (without_setpoints(path, **self._ends_as),)
+            return (self._without_setpoints(path),)
         oldest_us = utc_us - _EXPECTED_US
         if path.t0_utc_us >= oldest_us or all(late.agent != agent for late in self.paths.late(oldest_us)):
             return (path,)
-        return path, without_setpoints(path, **self._ends_as)
+        return path, self._without_setpoints(path)
+
+    def _without_setpoints(self, path: PredictedPath) -> PredictedPath:
+        keeps_s, coasts_s = self._loss_s()
+        lag_s, drag_1_s = self._model.lag_s, self._model.drag_1_s
+        return without_setpoints(path, lag_s=lag_s, drag_1_s=drag_1_s, keeps_s=keeps_s, coasts_s=coasts_s)
 
     def life_sign(self, agent: int, utc_us: int) -> str:
         """Return what speaks against an operator's word that a peer has ended: it was just heard; or "".

@@ -199,21 +199,32 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
     return found
 
 
-def without_setpoints(path: PredictedPath, *, lag_s: float = 0.0, drag_1_s: float = 0.0) -> PredictedPath:
+def without_setpoints(
+    path: PredictedPath,
+    *,
+    lag_s: float = 0.0,
+    drag_1_s: float = 0.0,
+    keeps_s: float | None = None,
+    coasts_s: float | None = None,
+) -> PredictedPath:
     """Return the path of a vehicle that has received no setpoint since it began to fly a path.
 
     Its autopilot keeps the last attitude for a while, so the level acceleration goes on that the vehicle has when it
-    has taken that attitude, instead of what was planned to follow. Where the returned path ends the autopilot brakes,
-    as beyond the end of any path.
+    has taken that attitude, instead of what was planned to follow. It may then fly on level. Where the returned path
+    ends the autopilot brakes, as beyond the end of any path.
 
     Args:
         path: what was planned.
         lag_s: time in which the vehicle takes the attitude of a setpoint. It flies as planned meanwhile: a path that
             turns goes on to turn.
         drag_1_s: linear drag over mass.
+        keeps_s: how long the autopilot keeps the attitude; None: as agents set a PX4.
+        coasts_s: until when it flies on level then; None: it brakes at once.
     """
     dt_s = path.dt_us * 1e-6
-    lag = max(0, min(round(min(lag_s, _KEEPS_S) / dt_s), len(path.pos_ned_m) - 3))
+    keeps_s = _KEEPS_S if keeps_s is None else keeps_s
+    coasts_s = keeps_s if coasts_s is None else max(keeps_s, coasts_s)
+    lag = max(0, min(round(min(lag_s, keeps_s) / dt_s), len(path.pos_ned_m) - 3))
     first, second = path.pos_ned_m[lag : lag + 2]
     bend = path.pos_ned_m[lag + 2] - 2.0 * second + first if len(path.pos_ned_m) > 2 else np.zeros(3)
     bend[2] = 0.0
@@ -221,8 +232,8 @@ def without_setpoints(path: PredictedPath, *, lag_s: float = 0.0, drag_1_s: floa
     bend *= most_m / max(size_m, most_m)
     accel = bend / dt_s**2
     vel = (second - first) / dt_s - 0.5 * dt_s * accel  # at the first point
-    ahead_s, keeps_s = grid(max(1, round(_STOPS_US / path.dt_us) - lag)) * dt_s, _KEEPS_S - lag * dt_s
-    limits = {"keeps_s": keeps_s, "coasts_s": keeps_s, "drag_1_s": drag_1_s}
+    ahead_s = grid(max(1, round(_STOPS_US / path.dt_us) - lag)) * dt_s
+    limits = {"keeps_s": keeps_s - lag * dt_s, "coasts_s": coasts_s - lag * dt_s, "drag_1_s": drag_1_s}
     pos = without_setpoints_ned_m(first, vel, accel, ahead_s, **limits)
     return replace(path, pos_ned_m=np.concatenate((path.pos_ned_m[:lag], pos)) if lag else pos)
 

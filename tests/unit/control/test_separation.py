@@ -105,6 +105,19 @@ def test_without_setpoints_a_turn_goes_on_until_the_attitude_is_that_of_the_last
     np.testing.assert_array_equal(without_setpoints(path, lag_s=0.0).pos_ned_m, without_setpoints(path).pos_ned_m)
 
 
+def test_without_setpoints_an_autopilot_that_takes_over_late_keeps_the_attitude_and_flies_on_level() -> None:
+    """As an ArduCopter: GUID_TIMEOUT 1 s, FS_GCS_TIMEOUT 2 s."""
+    t_s = np.arange(6) * (DT_US * 1e-6)
+    turns = np.stack([2.0 * t_s, 0.5 * t_s**2, np.full(6, -2.0)], axis=1)
+    flown = align(without_setpoints(peer(turns), keeps_s=1.0, coasts_s=2.0), UTC_US, 100_000, 60, brake_m_s2=3.0)
+    kept_s = 0.1 * np.arange(11)
+    np.testing.assert_allclose(flown[:11, :2], np.stack([2.0 * kept_s, 0.5 * kept_s**2], axis=1), atol=1e-9)
+    vel_m_s = np.diff(flown[:, :2], axis=0) / 0.1
+    np.testing.assert_allclose(vel_m_s[16:20], np.tile([2.0, 1.05 + ANSWER_S], (4, 1)), atol=0.03)
+    assert np.linalg.norm(vel_m_s[22]) < np.linalg.norm(vel_m_s[19]) - 0.1, "it brakes then"
+    assert np.linalg.norm(vel_m_s[-1]) < 1e-6
+
+
 @pytest.mark.parametrize("points", [2, 3])
 def test_without_setpoints_no_more_acceleration_is_kept_than_a_vehicle_has(points: int) -> None:
     jump = peer(np.array([[0.0, 0.0, -2.0], [0.0, 0.0, -2.0], [9.0, 0.0, -2.0]])[:points])
