@@ -17,6 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import psutil
 
@@ -186,7 +187,7 @@ class Child:
         self.log = directory / f"{command.name}.log"
         self.ended_s: float | None = None
         try:
-            with self.log.open("ab") as log:
+            with _opened_log(self.log) as log:
                 self.process = subprocess.Popen(
                     command.argv,
                     stdin=subprocess.DEVNULL,
@@ -277,6 +278,18 @@ class Child:
             log.seek(max(0, self.log.stat().st_size - _TAIL_BYTES))
             return log.read().decode("utf-8", errors="replace")
         return ""
+
+
+def _opened_log(path: Path) -> BinaryIO:
+    """Open the log of a process; nothing is kept of what it prints where the disk or its folder takes no file.
+
+    Raises:
+        OSError: no descriptor is left.
+    """
+    try:
+        return path.open("ab")
+    except OSError:
+        return Path(os.devnull).open("ab")
 
 
 def end_all(children: Sequence[Child], grace_s: float) -> None:

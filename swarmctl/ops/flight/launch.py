@@ -167,6 +167,20 @@ def _run_folder(config: Config, options: LaunchOptions) -> Iterator[Path]:
         yield directory
 
 
+def _private_folder(config: Config) -> Path:
+    """Make the folder, of mode 0700, of what has to outlive the run folder: sockets, and the configuration.
+
+    Raises:
+        StartError: it can't be made.
+    """
+    try:
+        directory = Path(tempfile.mkdtemp(prefix="swarm-"))
+        (directory / CONFIG).write_text(dump(config), encoding="utf-8")
+    except OSError as error:
+        raise StartError(f"temporary files can't be written: {error}. Make room, or choose another TMPDIR") from error
+    return directory
+
+
 class Launcher(Services):
     """Starts the processes of one launch, and ends them."""
 
@@ -179,7 +193,7 @@ class Launcher(Services):
         *,
         part: SwarmPart,
     ) -> None:
-        self._socket_dir = Path(tempfile.mkdtemp(prefix="swarm-"))  # mode 0700
+        self._private_dir = _private_folder(config)
         self._config = config
         self._options = options
         self._reserved = reserved
@@ -187,7 +201,7 @@ class Launcher(Services):
         identity = None if part.links is None else part.links.identity
         self.context = RunContext(
             part.run,
-            f"{SCHEME}{self._socket_dir}/bus.sock",
+            f"{SCHEME}{self._private_dir}/bus.sock",
             directory,
             part.agents,
             identity,
@@ -258,7 +272,7 @@ class Launcher(Services):
             self.bus.close()
         end_all(router, _ROUTER_STOP_S)
         self._reserved.release()
-        shutil.rmtree(self._socket_dir, ignore_errors=True)
+        shutil.rmtree(self._private_dir, ignore_errors=True)
         ended = [*self.children.values(), *self._shared]
         self.log.write("stopped", exit_codes={child.name: child.poll() for child in ended})
 
@@ -266,15 +280,23 @@ class Launcher(Services):
         """Start an agent on the vehicle of an ended one; it records separately and can fly without a router."""
         router = self.children[ROUTER]
         endpoint = self.context.endpoint if router.poll() is None else NO_BUS
-        directory = self.context.directory / "recovery"
-        directory.mkdir(exist_ok=True)
+        directory = self._recovery_folder()
         context = replace(self.context, endpoint=endpoint, directory=directory, agents=(agent,))
         place = self.context.agents.index(agent)
         own = slice(place, place + 1)
         ends = self._reserved.sockets[own], self._reserved.vehicle_sockets[own]
-        config_path = self.context.directory / CONFIG
+        config_path = self._private_dir / CONFIG
         (command,) = agent_commands(self._config, context, *ends, config_path=config_path)
         return Child(replace(command, argv=(*command.argv, "--only-land", *self._originals(agent))), directory)
+
+    def _recovery_folder(self) -> Path:
+        """Return where what lands a vehicle records: not in the run folder where that takes nothing, or is gone."""
+        directory = self.context.directory / "recovery"
+        try:
+            directory.mkdir(exist_ok=True)
+        except OSError:
+            return self._private_dir
+        return directory
 
     def _originals(self, agent: int) -> tuple[str, ...]:
         """Return the arguments by which another agent knows the parameters to set back; say so where they are lost."""

@@ -42,7 +42,8 @@ def sum_up(
         for line in (*violation_lines(known), *summary_lines(known, directory)):
             print_line(line)
         result.problems.append(f"summary: {error}")
-        print_line(f"the run can't be judged: {error!r}. What was recorded is in {directory}")
+        why = f"{error!r}. What was recorded is in {directory}"
+        print_line(f"the run can't be judged: {why if directory.is_dir() else f'{directory} was removed or renamed'}")
         return False
     for line in (*violation_lines(summary), *summary_lines(summary, directory)):
         print_line(line)

@@ -38,6 +38,13 @@ def test_the_last_words_of_a_process_control_no_terminal(tmp_path: Path) -> None
     assert child.line_with("owned") == r"\x1b]0;owned\x07"
 
 
+def test_a_process_whose_log_can_not_be_opened_runs_without_it(tmp_path: Path) -> None:
+    """As in a run folder that was removed, or on a disk without room: vehicles are landed all the same."""
+    child = Child(Command("x", (sys.executable, "-Sc", "print('lost'); raise SystemExit(4)")), tmp_path / "removed")
+    assert child.wait(60.0)
+    assert child.how_it_ended() == "ended with exit code 4"
+
+
 @pytest.mark.parametrize(
     ("agents", "most", "shares"),
     [

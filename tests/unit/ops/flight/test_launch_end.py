@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
@@ -16,7 +17,7 @@ import pytest
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.topics import OPERATOR
 from swarmctl.bus.zenoh_bus import SCHEME
-from swarmctl.config import Config
+from swarmctl.config import Config, load
 from swarmctl.core.operator_verbs import Order
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops import running_launches
@@ -27,7 +28,7 @@ from swarmctl.ops.orders.obstacle_list import read_obstacles
 from swarmctl.ops.orders.operator import joined, read_statuses
 from swarmctl.ops.orders.order_delivery import deliver
 from swarmctl.ops.preflight import ReservedPorts
-from swarmctl.ops.processes import ROUTER, Command
+from swarmctl.ops.processes import ROUTER, Child, Command
 from swarmctl.ops.running_launches import RunningLaunch, announce, find_launch
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.wall_clock import WallClock
@@ -104,6 +105,22 @@ def test_a_verb_that_finds_a_launch_in_its_last_moment_says_that_it_is_ending(
 def launcher(folder: Path, agents: tuple[int, ...] = ()) -> Launcher:
     ports = ReservedPorts(sockets=(), ports=(), view_port=0)
     return Launcher(Config(), LaunchOptions(), ports, folder, part=SwarmPart(run="circle-1a", agents=agents))
+
+
+def test_a_vehicle_is_landed_though_the_run_folder_is_gone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What lands it has a configuration to read, and a folder to record into, as agents refuse to begin without."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    services = launcher(tmp_path / "removed", agents=(0, 1))
+    services.children[ROUTER] = Child(Command(ROUTER, (sys.executable, "-Sc", "")), tmp_path)
+    monkeypatch.setattr(launching, "Child", lambda command, folder: SimpleNamespace(folder=folder, **asdict(command)))
+    found = cast(Any, services.recover(1))
+    words = dict(zip(found.argv, found.argv[1:], strict=False))
+    assert words["--id"] == "1"
+    assert load(Path(words["--config"])) == Config()
+    assert Path(words["--run-dir"]).is_dir()
+    assert found.folder.is_dir()
+    services.stop(0.0)
+    assert not found.folder.exists()
 
 
 def test_a_launch_is_ending_from_the_end_of_its_agents_until_its_report_is_written(

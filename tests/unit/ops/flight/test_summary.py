@@ -45,6 +45,13 @@ def sum_up(folder: Path, limit: int, *more: str) -> list[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.splitlines()
 
 
+def test_a_run_folder_that_was_removed_is_named_as_removed(tmp_path: Path) -> None:
+    lines = sum_up(tmp_path / "removed", -1)
+    assert [line for line in lines if "was removed or renamed" in line]
+    assert not [line for line in lines if "What was recorded is in" in line]
+    assert "exit code 4" in lines
+
+
 def test_a_full_disk_costs_the_files_and_not_the_verdict(folder: Path) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     lines = sum_up(folder, 0)
