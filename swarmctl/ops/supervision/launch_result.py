@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
 
 
@@ -41,5 +42,11 @@ class LaunchResult:
 
 
 def why_it_failed(outcome: str, last_line: str) -> str:
-    """Return why an agent failed: the outcome of its mission, or its last line after a complete one."""
-    return (outcome if outcome != "completed" else "") or last_line or "no reason given"
+    """Return why an agent failed: the outcome of its mission, and its last line where that says something else.
+
+    A complete mission, or one that an operator has ended, is not what an agent fails for.
+    """
+    told = "" if outcome in ("completed", OPERATOR_STOP) else outcome
+    if told and told in last_line:
+        return told
+    return "; ".join(filter(None, (told, last_line))) or "no reason given"

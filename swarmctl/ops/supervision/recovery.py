@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
+from swarmctl.bus.messages.json_messages import StatusMessage
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.processes import Child
@@ -30,6 +31,7 @@ class Recovery:
     def __init__(self, start: Callable[[int], Child], sysids: Sequence[int]) -> None:
         self._start, self._sysids = start, sysids
         self._begun_s: dict[int, float] = {}
+        self._before: dict[int, tuple[StatusMessage, float]] = {}  # what was heard last of an ended agent, and when
         self._lost: set[int] = set()  # agents whose vehicles are not known to be down, and are not watched any more
 
     def is_on(self, agent: int) -> bool:
@@ -58,6 +60,7 @@ class Recovery:
             self._lost |= {view.agent} if view.status is not None else set()
             return None
         self._begun_s[view.agent] = time.monotonic()
+        self._before[view.agent] = view.status, view.received_s
         try:
             return self._start(view.agent)
         except (StartError, OSError):
@@ -69,16 +72,27 @@ class Recovery:
         return [self._words(view) for view in views if view.agent in self._lost]
 
     def give_up(self, views: Sequence[AgentView]) -> None:
-        """Count every vehicle whose agent is killed before it was done as lost."""
-        going = (view for view in views if view.status is not None and view.status.phase != Phase.DONE)
-        self._lost |= {view.agent for view in going if view.status and view.status.phase >= Phase.ARM}
+        """Count every vehicle whose agent is killed before it was done as lost; so who was to be landed and was not."""
+        for view in views:
+            status, _, _ = self._last_known(view)
+            if status is not None and Phase.ARM <= status.phase < Phase.DONE:
+                self._lost.add(view.agent)
+
+    def _last_known(self, view: AgentView) -> tuple[StatusMessage | None, float, bool]:
+        """Return the newest status of who has heard the vehicle, its time, and whether it is of the ended agent."""
+        status, before = view.status, self._before.get(view.agent)
+        if before is None or status is None:
+            return status, view.received_s, False
+        has_heard_it = status.boot_id != before[0].boot_id and status.phase != Phase.CONNECT
+        return (status, view.received_s, False) if has_heard_it else (*before, True)
 
     def _words(self, view: AgentView) -> str:
-        status = view.status
+        status, received_s, is_unheard = self._last_known(view)
         assert status is not None  # of who was never heard nothing is claimed
         armed = "armed" if status.armed else "not yet told to be armed"
+        since = "; what was to land it has not heard it" if is_unheard else ""
         return (
             f"vehicle {self._sysids[view.agent]} (agent-{view.agent}) may be armed or in the air: it was {armed}, in "
-            f"{name_of(Phase, status.phase)}, {time.monotonic() - view.received_s:.0f} s ago. "
+            f"{name_of(Phase, status.phase)}, {time.monotonic() - received_s:.0f} s ago{since}. "
             "Land and disarm it by hand"
         )

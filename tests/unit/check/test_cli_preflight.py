@@ -234,9 +234,12 @@ def test_an_agents_text_controls_no_terminal(capsys: pytest.CaptureFixture[str])
         ("completed", "vehicle at udpin: silent for 15 s, given up", "vehicle at udpin: silent for 15 s, given up"),
         ("", "vehicle silent", "vehicle silent"),
         ("completed", "", "no reason given"),
+        ("stopped by the operator", "vehicle silent for 15 s, given up", "vehicle silent for 15 s, given up"),
+        ("battery", "vehicle silent for 15 s, given up", "battery; vehicle silent for 15 s, given up"),
+        ("battery", "", "battery"),
     ],
 )
-def test_an_agent_never_failed_with_completed_for_a_reason(outcome: str, last_line: str, words: str) -> None:
+def test_an_agent_failed_for_what_went_wrong_not_for_what_was_ordered(outcome: str, last_line: str, words: str) -> None:
     assert why_it_failed(outcome, last_line) == words
 
 

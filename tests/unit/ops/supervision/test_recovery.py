@@ -1,4 +1,4 @@
-"""Whose vehicle counts as down when its agent ends, whose is recovered, and whose is named as left."""
+"""Whose vehicle counts as down when its agent ends, whose is recovered, and whose is named as left: as it was heard."""
 
 from __future__ import annotations
 
@@ -78,10 +78,11 @@ def test_a_vehicle_whose_recovery_fails_is_named_and_not_recovered_again(code: i
 
 @pytest.mark.parametrize(("armed", "words"), [(True, "it was armed, in TRACK"), (False, "not yet told to be armed")])
 def test_what_was_heard_last_of_a_vehicle_that_is_left_is_told(armed: bool, words: str) -> None:
-    found, view = recovering()
+    found, view = Recovery(lambda _: CHILD, (1, 2, 3)), seen()
     assert view.status is not None
     view.status = msgspec.structs.replace(view.status, armed=armed)
-    found.begin(view, KILLED)
+    for _ in range(2):
+        found.begin(view, KILLED)
     assert words in found.left([view])[0]
 
 
@@ -121,3 +122,57 @@ def test_of_agents_that_are_killed_in_flight_the_vehicles_are_named() -> None:
     ]
     found.give_up([*views, AgentView(agent=3)])
     assert [words.split()[1] for words in found.left(views)] == ["2", "3"]
+
+
+def flown(seconds_ago: float = 40.0) -> AgentView:
+    """Return an agent that was last heard in flight."""
+    status = builders.status_message(phase=Phase.TRACK)
+    return AgentView(agent=0, status=status, received_s=time.monotonic() - seconds_ago)
+
+
+def recovered(view: AgentView, phase: Phase | None) -> Recovery:
+    """Return a recovery of its vehicle; the process that lands it has said that it is in a phase, or nothing."""
+    recovery = Recovery(lambda _: CHILD, (7,))
+    recovery.begin(view, KILLED)
+    view.received_s = time.monotonic()  # as the supervisor does, from when on it waits for that process
+    if phase is not None:
+        heard = builders.status_message(phase=phase)
+        view.status = msgspec.structs.replace(heard, boot_id=2, armed=phase != Phase.CONNECT)
+    return recovery
+
+
+def left(view: AgentView, phase: Phase | None) -> str:
+    recovery = recovered(view, phase)
+    recovery.begin(view, EXIT_START)
+    (words,) = recovery.left([view])
+    return words
+
+
+def test_a_vehicle_that_was_not_heard_again_is_told_as_it_was_last_heard() -> None:
+    for phase in (None, Phase.CONNECT):
+        words = left(flown(), phase)
+        assert "vehicle 7 (agent-0) may be armed or in the air: it was armed, in TRACK, 40 s ago" in words
+        assert "not heard" in words
+        assert "not yet told to be armed" not in words
+
+
+def test_a_vehicle_that_was_heard_again_is_told_as_it_was_then() -> None:
+    words = left(flown(), Phase.LAND)
+    assert "it was armed, in LAND, 0 s ago" in words
+    assert "not heard" not in words
+
+
+def test_a_vehicle_whose_landing_is_killed_before_it_was_heard_is_left() -> None:
+    """As by a second Ctrl-C, three seconds after its agent was killed."""
+    for phase in (None, Phase.CONNECT, Phase.LAND):
+        view = flown()
+        recovery = recovered(view, phase)
+        recovery.give_up([view])
+        assert len(recovery.left([view])) == 1, phase
+
+
+def test_a_vehicle_that_was_seen_to_be_down_is_not_left() -> None:
+    view = flown()
+    recovery = recovered(view, Phase.DONE)
+    recovery.give_up([view])
+    assert recovery.left([view]) == []
