@@ -55,13 +55,17 @@ class SessionWatch:
 
     def __init__(self, bus: Bus, note: Callable[..., None]) -> None:
         self._bus, self._note = bus, note
-        self._reopened = 0
+        self._reopened = self._excused = 0
 
     def step(self) -> bool:
         """Record what is new; return whether anything is."""
-        reopened = self._bus.reopened()
+        reopened = self._bus.reopened() - self._excused
         if reopened <= self._reopened:
             return False
         self._reopened = reopened
         self._note(REOPENED, count=reopened)
         return True
+
+    def excuse(self) -> None:
+        """Leave out what is new: nobody was there to be heard."""
+        self._excused = self._bus.reopened() - self._reopened

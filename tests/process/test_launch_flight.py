@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,17 @@ class DeafBus(CountedBus):
 
     def reopened(self) -> int:
         return int(self._anew_s is not None and time.monotonic() > self._anew_s)
+
+
+class ReopeningBus(CountedBus):
+    """A session that is replaced once nobody is heard any more."""
+
+    def __init__(self, bus: Bus, is_silent: Callable[[], bool]) -> None:
+        super().__init__(bus)
+        self._is_silent = is_silent
+
+    def reopened(self) -> int:
+        return int(self._is_silent())
 
 
 @pytest.fixture(autouse=True)
@@ -390,6 +402,17 @@ def test_a_supervisor_that_is_deaf_hears_its_agents_again_and_calls_none_silent(
     assert scene.printed("agent-1", "is heard on another session", "the one before was deaf")
     assert '"bus_reopened"' in (tmp_path / "launch.events.jsonl").read_text()
     assert "land" not in scene.orders
+
+
+def test_silence_after_the_last_agent_has_ended_is_no_sign_of_a_deaf_session(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [ends(4, 0.3)])
+    assert scene.bus is not None
+    scene.bus = ReopeningBus(scene.bus, lambda: scene.children["agent-0"].poll() is not None)
+    result = scene.fly()
+    assert result.outcome == "failed"
+    assert scene.bus.reopened()  # the launch has waited for so long
+    assert not scene.printed("another session")
+    assert '"bus_reopened"' not in (tmp_path / "launch.events.jsonl").read_text()
 
 
 def test_control_a_supervisor_that_believes_its_deaf_session_lands_its_agents(

@@ -60,11 +60,16 @@ class BusReport:
             else:
                 yield sender, taken.line
 
-    def step(self) -> None:
-        """Report what is new: refused messages, the first of each kind in words, and another session."""
+    def step(self, *, anybody: bool = True) -> None:
+        """Report what is new: refused messages, the first of each kind in words, and another session.
+
+        Silence tells nothing of a session where `anybody` is false: nobody is left who could be heard.
+        """
         for message in self._bus.refused():
             self.refuse(*message)
         self._refusals.report(monotonic_us())
+        if not anybody:
+            self._sessions.excuse()
         if self._sessions.step() and not self._has_told_reopened:  # while there is nobody, it happens again and again
             self._has_told_reopened = True
             self._display.print_line(_REOPENED)

@@ -187,7 +187,7 @@ class FlightSupervisor:
             self._announce("obstacles", text, **recorded_list(adoption.after))
         for event, text in self._obstacles.news(adopted):
             self._announce(event, text)
-        self._report.step()
+        self._report.step(anybody=bool(self._running()))
 
     def _watch_essential_processes(self) -> None:
         """Start a router again; land all agents when it ends again and again, or the simulator has ended."""

@@ -64,6 +64,17 @@ def test_each_session_that_was_replaced_is_an_event_and_the_first_one_a_line() -
     assert len(said.lines) == 1
 
 
+def test_a_session_that_was_replaced_while_nobody_was_left_to_hear_is_not_told() -> None:
+    """As at the end of a launch, which waits for seconds after the last agent has ended."""
+    bus, said = Scripted(LocalHub(lambda: 0).connect("alpha")), Said()
+    report = BusReport(bus, said.note, said)
+    for sessions, anybody in ((0, True), (1, False), (1, True), (2, True)):
+        bus.sessions = sessions
+        report.step(anybody=anybody)
+    assert [fields["count"] for event, fields in said.events if event == REOPENED] == [1]
+    assert len(said.lines) == 1
+
+
 def test_the_first_refused_message_of_a_kind_is_a_line_unless_it_is_harmless() -> None:
     bus, said = Scripted(LocalHub(lambda: 0).connect("alpha")), Said()
     report = BusReport(bus, said.note, said)
