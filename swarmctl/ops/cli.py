@@ -29,6 +29,8 @@ from swarmctl.process_lifetime import module_command
 from swarmctl.standard_streams import output_is_lost
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from swarmctl.bus.messages.json_messages import StatusMessage
     from swarmctl.ops.running_launches import RunningLaunch
 
@@ -208,11 +210,11 @@ def status(
         with contextlib.suppress(KeyboardInterrupt):
             _watch(launch, as_json)
         return EXIT_OK
-    statuses = operator.read_statuses(launch)
+    statuses, gone = operator.read_agents(launch)
     if as_json:
         print(operator.as_json(statuses))
     else:
-        _show(launch, statuses)
+        _show(launch, statuses, gone)
     return EXIT_OK
 
 
@@ -328,9 +330,12 @@ def _overrides(agents: int | None, duration: float | None, seed: int | None, set
     return [*(sets or ()), *(f"{key}={value}" for key, value in named if value is not None)]
 
 
-def _show(launch: RunningLaunch, statuses: dict[int, StatusMessage]) -> None:
+def _show(launch: RunningLaunch, statuses: dict[int, StatusMessage], gone: Collection[int]) -> None:
     from swarmctl.ops.supervision.status_table import AgentView, print_statuses
 
     print(f"status: {launch.run}", file=sys.stderr)  # rows alone on standard output
     views = [AgentView(agent=number, status=statuses.get(number)) for number in range(launch.agents)]
+    for view in views:
+        if view.status is None:
+            view.note = "has ended, its vehicle is on the ground" if view.agent in gone else "not heard"
     print_statuses(views, launch.run)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager
 
 import msgspec
@@ -18,12 +18,15 @@ from swarmctl.bus.messages.json_messages import StatusMessage, decode_status
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
-from swarmctl.bus.topics import ANSWER, OBSTACLES, OPERATOR, STATUS
+from swarmctl.bus.topics import ANSWER, ENDED, OBSTACLES, OPERATOR, STATUS
+from swarmctl.bus.vouched_ends import VouchedEnds
 from swarmctl.errors import StartError
 from swarmctl.ops.running_launches import RunningLaunch, refuse_ending, runs
+from swarmctl.wall_clock import monotonic_us
 
 ANSWER_S = 5.0  # longest wait for what is asked over the bus
 REPEAT_S = 0.2
+_UNHEARD_US = 1_000_000  # after which an agent that has ended counts as gone: another process would have been heard
 
 
 @contextmanager
@@ -39,7 +42,12 @@ def joined(launch: RunningLaunch) -> Iterator[Bus]:
             launch.bus,
             launch.run,
             OPERATOR if launch.identity is None else launch.identity.name,
-            {STATUS: senders, ANSWER: senders, OBSTACLES: list_keepers(launch.identity)},
+            {
+                STATUS: senders,
+                ANSWER: senders,
+                ENDED: tuple(vouchers(launch)),
+                OBSTACLES: list_keepers(launch.identity),
+            },
             identity=launch.identity,
             max_age_us=FOR_OPERATORS_US,
             utc_us=launch.utc_us,
@@ -50,6 +58,44 @@ def joined(launch: RunningLaunch) -> Iterator[Bus]:
     except StartError:
         refuse_ending(launch)
         raise
+
+
+def vouchers(launch: RunningLaunch) -> Mapping[str, Set[int]]:
+    """Return the agents of which each sender may say that they have ended: all, or those of a host."""
+    if launch.identity is None:
+        return {OPERATOR: frozenset(range(launch.agents))}
+    return {speaker.name: frozenset(speaker.agents) for speaker in launch.identity.roster.speakers if speaker.agents}
+
+
+class GoneAgents:
+    """Knows who has ended and left its vehicle on the ground, disarmed, as its supervisor says again and again.
+
+    Args:
+        vouchers: agents of which each sender may say so.
+    """
+
+    def __init__(self, vouchers: Mapping[str, Set[int]]) -> None:
+        self._ends = VouchedEnds(vouchers)
+        self._heard: set[int] = set()
+        self._began_us: int | None = None
+        self._now_us = 0
+
+    def receive(self, bus: Bus, now_us: int) -> None:
+        """Take in what has arrived about ends."""
+        self._now_us = now_us
+        if self._began_us is None:
+            self._began_us = now_us
+        for sender, payload in bus.receive(ENDED):
+            self._ends.take(sender, payload)
+
+    def hear(self, agent: int) -> None:
+        """Note that an agent speaks: it is another process than one that has ended."""
+        self._heard.add(agent)
+
+    def has(self, agent: int) -> bool:
+        """Return whether an agent has ended, its vehicle is down, and no other process speaks for it."""
+        listened_us = self._now_us - (self._now_us if self._began_us is None else self._began_us)
+        return agent not in self._heard and listened_us >= _UNHEARD_US and self._ends.is_down(agent, None)
 
 
 def list_keepers(identity: OwnIdentity | None) -> tuple[str, ...]:
@@ -81,11 +127,21 @@ def read_statuses(launch: RunningLaunch) -> dict[int, StatusMessage]:
     Raises:
         StartError: the launch is ending.
     """
+    return read_agents(launch)[0]
+
+
+def read_agents(launch: RunningLaunch) -> tuple[dict[int, StatusMessage], frozenset[int]]:
+    """Return the newest status of every agent that publishes one in time, and who has ended with its vehicle down.
+
+    Raises:
+        StartError: the launch is ending.
+    """
+    agents, gone = range(launch.agents), GoneAgents(vouchers(launch))
     with joined(launch) as bus:
-        statuses = _statuses(bus, range(launch.agents), ANSWER_S)
+        statuses = _statuses(bus, agents, ANSWER_S, gone)
     if len(statuses) < launch.agents:
         refuse_ending(launch)
-    return statuses
+    return statuses, frozenset(agent for agent in agents if gone.has(agent))
 
 
 def watch_statuses(launch: RunningLaunch, every_s: float) -> Iterator[dict[int, StatusMessage]]:
@@ -106,8 +162,8 @@ def vector(key: str, text: str, problems: list[str]) -> tuple[float, float, floa
     return (north, east, down)
 
 
-def _statuses(bus: Bus, agents: range, timeout_s: float) -> dict[int, StatusMessage]:
-    """Return the newest status of each of `agents`, once all have published one or the time is up."""
+def _statuses(bus: Bus, agents: range, timeout_s: float, gone: GoneAgents | None = None) -> dict[int, StatusMessage]:
+    """Return the newest status of each of `agents`, once all but those gone have published one or the time is up."""
     heard: dict[int, StatusMessage] = {}
     deadline_s = time.monotonic() + timeout_s
     while True:
@@ -115,7 +171,12 @@ def _statuses(bus: Bus, agents: range, timeout_s: float) -> dict[int, StatusMess
             status = decode_status(payload)
             if status is not None and status.agent in agents and sender == agent_name(status.agent):
                 heard[status.agent] = status
-        if len(heard) == len(agents) or time.monotonic() >= deadline_s:
+                if gone is not None:
+                    gone.hear(status.agent)
+        if gone is not None:
+            gone.receive(bus, monotonic_us())
+        missing = [agent for agent in agents if agent not in heard and not (gone is not None and gone.has(agent))]
+        if not missing or time.monotonic() >= deadline_s:
             break
         time.sleep(0.02)
     return dict(sorted(heard.items()))

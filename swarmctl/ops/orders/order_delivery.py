@@ -20,10 +20,12 @@ from swarmctl.core.operator_verbs import OPERATOR_VERBS, PEER, Answer, Order
 from swarmctl.core.text import printable
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, joined
+from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, GoneAgents, joined, vouchers
 from swarmctl.ops.running_launches import RunningLaunch, refuse_ending
 
 _POLL_S = 0.02
+_IS_DOWN = Phase.DONE.name  # what is obeyed in this phase asks nothing of a vehicle on the ground
+_GONE = "it has ended, its vehicle is on the ground"
 _MOST_MESSAGES = 32  # of one repetition, so that they fit into an agent's ring
 
 
@@ -36,10 +38,13 @@ class Reply:
     answer: Answer | None  # None: it was silent
     phase: Phase | None = None  # by its newest status
     stopping: bool = True  # false: a stop it has accepted is not seen to have begun
+    is_gone: bool = False  # it has ended, and left its vehicle on the ground
 
     @property
     def problem(self) -> str:
         """Return why the order is not known to be obeyed, or ""."""
+        if self.answer is None and self.is_gone:
+            return "" if _IS_DOWN in OPERATOR_VERBS[self.verb].phases else f"{agent_name(self.agent)}: {_GONE}"
         if self.answer is None:
             return f"{agent_name(self.agent)} did not answer within {ANSWER_S:.0f} s"
         if not self.answer.accepted:
@@ -52,11 +57,15 @@ class Reply:
     @property
     def comes_to(self) -> str:
         """Return what an accepted order comes to, as the agent says it; "" where its name says it."""
+        if self.answer is None and self.is_gone and not self.problem:
+            return _GONE
         return printable(self.answer.reason) if self.answer is not None and self.answer.accepted else ""
 
     @property
     def line(self) -> str:
         """Return one line for the operator."""
+        if self.answer is None:
+            return self.problem or f"{agent_name(self.agent)}: {self.comes_to}"
         where = "" if self.phase is None else f", {self.phase.name}"
         comes_to = f"; {self.comes_to}" if self.comes_to else ""
         return self.problem or f"{agent_name(self.agent)} accepts{where}{comes_to}"
@@ -84,9 +93,11 @@ class OrderDelivery:
         order: what is asked; it gets a number of its own.
         agents: numbers of the agents asked.
         everybody: whether these are all there are.
+        gone: who has ended; nobody is known to have by default.
     """
 
-    def __init__(self, order: Order, agents: Sequence[int], everybody: bool) -> None:
+    def __init__(self, order: Order, agents: Sequence[int], everybody: bool, gone: GoneAgents | None = None) -> None:
+        self._gone = gone or GoneAgents({})
         self._order = numbered(order)
         self._is_stop = OPERATOR_VERBS[order.verb].is_stop
         self._agents, self._everybody = agents, everybody
@@ -101,6 +112,8 @@ class OrderDelivery:
             if status is not None and status.agent in self._agents and sender == agent_name(status.agent):
                 self._statuses[status.agent] = status
                 self._ahead_us[status.agent] = status.utc_us - utc_us
+                self._gone.hear(status.agent)
+        self._gone.receive(bus, utc_us)
         for sender, payload in bus.receive(ANSWER):
             message = decode_answer(payload)
             if message is None or message.agent not in self._agents or sender != agent_name(message.agent):
@@ -133,13 +146,16 @@ class OrderDelivery:
                 answer=self._answers.get(agent),
                 phase=Phase(self._statuses[agent].phase) if agent in self._statuses else None,
                 stopping=self._is_stopping(agent),
+                is_gone=self._gone.has(agent),
             )
             for agent in self._agents
         ]
 
     def _is_settled(self, agent: int) -> bool:
         answer = self._answers.get(agent)
-        return answer is not None and (not answer.accepted or self._is_stopping(agent))
+        if answer is None:
+            return self._gone.has(agent)
+        return not answer.accepted or self._is_stopping(agent)
 
     def _is_stopping(self, agent: int) -> bool:
         """Return whether the order is no stop, or the agent is seen to land or to be on its way there."""
@@ -205,7 +221,7 @@ def deliver(
         StartError: the bus can't be joined, or the launch is ending and nobody is left to answer.
     """
     asked = addressed(launch, order, agents)
-    delivery = OrderDelivery(order, asked, everybody=len(asked) == launch.agents)
+    delivery = OrderDelivery(order, asked, len(asked) == launch.agents, GoneAgents(vouchers(launch)))
     with joined(launch) as bus:
         began_s = repeated_s = time.monotonic()
         while delivery.open and time.monotonic() - began_s < ANSWER_S:

@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 import tempfile
+import time
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,14 +14,18 @@ from typing import Any, cast
 
 import msgspec
 import pytest
+from typer.testing import CliRunner
 
+from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
-from swarmctl.bus.topics import OPERATOR
+from swarmctl.bus.messages.json_messages import EndedMessage, encode_message
+from swarmctl.bus.topics import ENDED, OPERATOR, STATUS
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config, load
 from swarmctl.core.operator_verbs import Order
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops import running_launches
+from swarmctl.ops.cli import app
 from swarmctl.ops.flight import launch as launching
 from swarmctl.ops.flight.launch import Launcher, LaunchOptions, SwarmPart, judged
 from swarmctl.ops.orders import obstacle_list, operator, order_delivery
@@ -32,6 +37,7 @@ from swarmctl.ops.processes import ROUTER, Child, Command
 from swarmctl.ops.running_launches import RunningLaunch, announce, find_launch
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.wall_clock import WallClock
+from tests import builders
 
 ENDING = r"circle.* is ending: nobody answers any more, it writes its report to .*run"
 
@@ -100,6 +106,24 @@ def test_a_verb_that_finds_a_launch_in_its_last_moment_says_that_it_is_ending(
     announce(launch)
     with pytest.raises(StartError, match="no router answers"), joined(launch):
         pass
+
+
+def test_who_has_ended_with_its_vehicle_down_is_told_apart_from_who_is_not_heard(
+    launch: RunningLaunch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub = LocalHub(lambda: time.monotonic_ns() // 1000)
+    names = [agent_name(agent) for agent in range(3)]
+    bus = hub.connect(OPERATOR, {STATUS: names, ENDED: [OPERATOR]})
+    hub.connect(names[0]).publish(STATUS, encode_message(builders.status_message(agent=0)))
+    bus.publish(ENDED, encode_message(EndedMessage(agent=1, boot_id=5, is_down=True)))
+    monkeypatch.setattr(operator, "ANSWER_S", 1.2)
+    monkeypatch.setattr(operator, "join_bus", lambda *_, **__: bus)
+    result = CliRunner().invoke(app, ["status"])
+    assert result.exit_code == 0
+    first, second, third = result.stdout.splitlines()[1:]
+    assert "TRACK" in first
+    assert second.split() == ["1", "has", "ended,", "its", "vehicle", "is", "on", "the", "ground"]
+    assert third.split() == ["2", "not", "heard"]
 
 
 def launcher(folder: Path, agents: tuple[int, ...] = ()) -> Launcher:

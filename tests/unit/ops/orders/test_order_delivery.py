@@ -9,13 +9,14 @@ import pytest
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
-from swarmctl.bus.messages.json_messages import AnswerMessage, decode_command, encode_message
+from swarmctl.bus.messages.json_messages import AnswerMessage, EndedMessage, decode_command, encode_message
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.topics import ANSWER, COMMAND, OPERATOR, STATUS
+from swarmctl.bus.topics import ANSWER, COMMAND, ENDED, OPERATOR, STATUS
 from swarmctl.core.operator_verbs import PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.ops.orders.operator import GoneAgents
 from swarmctl.ops.orders.order_delivery import OrderDelivery, Reply, addressed
 from swarmctl.ops.running_launches import RunningLaunch
 from tests import builders
@@ -29,6 +30,7 @@ class Scene:
     """An operator, and agents with real filters of orders: some refuse, and those who are `lost` hear nothing."""
 
     def __init__(self, verb: str, refusals: Mapping[int, str] | None = None, agents: int = 3) -> None:
+        self.ended: dict[int, EndedMessage] = {}  # agents that publish nothing, as their supervisor says
         self.now_us = UTC_US
         self.hub = LocalHub(lambda: self.now_us)
         self.bus = self.hub.connect(OPERATOR)
@@ -39,7 +41,9 @@ class Scene:
         self.obeyed: list[int] = []
         self.phases = [Phase.TRACK] * agents
         self.lands = True
-        self.delivery = OrderDelivery(Order(verb), range(agents), everybody=True)
+        gone = GoneAgents({"alpha": frozenset(range(agents))})
+        self.supervisor = self.hub.connect("alpha")
+        self.delivery = OrderDelivery(Order(verb), range(agents), everybody=True, gone=gone)
         self.sent = 0
 
     def repeat(self, times: int = 1) -> None:
@@ -50,9 +54,12 @@ class Scene:
             self.now_us += 100_000
             for i, bus in enumerate(self.agents):
                 for sender, payload in bus.receive(COMMAND):
-                    if i not in self.lost:
+                    if i not in self.lost and i not in self.ended:
                         self.take(i, sender, payload)
-                self.publish(i)
+                if i not in self.ended:
+                    self.publish(i)
+            for end in self.ended.values():
+                self.supervisor.publish(ENDED, encode_message(end))
             self.now_us += 100_000
             self.delivery.receive(self.bus, self.now_us)
 
@@ -105,6 +112,53 @@ def test_who_is_silent_is_asked_again_for_longer_than_an_order_is_valid_and_obey
     scene.repeat(3)
     assert scene.problems == []
     assert sorted(scene.obeyed) == [0, 1, 2]
+
+
+def end_of(agent: int, *, is_down: bool) -> EndedMessage:
+    return EndedMessage(agent=agent, boot_id=1, is_down=is_down)
+
+
+def test_who_has_ended_with_its_vehicle_down_is_not_waited_for_and_fails_no_landing() -> None:
+    scene = Scene("land")
+    scene.ended = {1: end_of(1, is_down=True)}
+    scene.repeat(10)
+    assert scene.delivery.open == []
+    assert scene.problems == []
+    reply = scene.delivery.replies()[1]
+    assert reply.line == "agent-1: it has ended, its vehicle is on the ground"
+    assert reply.as_dict() == {
+        "agent": 1,
+        "accepted": None,
+        "phase": None,
+        "problem": "",
+        "comes_to": "it has ended, its vehicle is on the ground",
+    }
+
+
+def test_who_has_ended_can_not_hold() -> None:
+    scene = Scene("hold")
+    scene.ended = {1: end_of(1, is_down=True)}
+    scene.repeat(10)
+    assert scene.delivery.open == []
+    assert scene.problems == ["agent-1: it has ended, its vehicle is on the ground"]
+
+
+def test_who_has_ended_and_may_be_in_the_air_is_asked_on_as_another_process_may_land_it() -> None:
+    scene = Scene("land")
+    scene.ended = {1: end_of(1, is_down=False)}
+    scene.repeat(10)
+    assert scene.delivery.open == [1]
+    assert scene.problems == ["agent-1 did not answer within 5 s"]
+
+
+def test_who_speaks_has_not_ended_whatever_is_said_of_a_process_before_it() -> None:
+    scene = Scene("land")
+    scene.lost = {1}
+    scene.repeat()
+    scene.ended = {1: end_of(1, is_down=True)}
+    scene.repeat(10)
+    assert scene.delivery.open == [1]
+    assert scene.problems == ["agent-1 did not answer within 5 s"]
 
 
 def test_a_lost_answer_is_given_again_and_the_order_is_obeyed_once() -> None:
