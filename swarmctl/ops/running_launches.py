@@ -98,7 +98,7 @@ def find_launch(run: str | None) -> RunningLaunch:
         names = ", ".join(f"{launch.run} ({launch.agents} agents, {launch.run_dir})" for launch in found)
         raise ConfigError("--run", [f"{len(found)} launches run, choose one by its name or folder: {names}"])
     if run is not None:
-        known = ", ".join(launch.run for launch in running) or "none"
+        known = ", ".join(f"{launch.run} ({launch.run_dir})" for launch in running) or "none"
         raise StartError(f"--run {run}: no launch runs there or has that name; running: {known}")
     raise StartError("no launch runs. Start one with: swarmctl launch")
 

@@ -26,6 +26,7 @@ from swarmctl.wall_clock import monotonic_us
 
 ANSWER_S = 5.0  # longest wait for what is asked over the bus
 REPEAT_S = 0.2
+_CONNECT_MS = 3000
 _UNHEARD_US = 1_000_000  # after which an agent that has ended counts as gone: another process would have been heard
 
 
@@ -51,13 +52,27 @@ def joined(launch: RunningLaunch) -> Iterator[Bus]:
             identity=launch.identity,
             max_age_us=FOR_OPERATORS_US,
             utc_us=launch.utc_us,
-            connect_timeout_ms=3000,
+            connect_timeout_ms=_CONNECT_MS,
         )
+    except StartError as error:
+        refuse_ending(launch)
+        raise StartError(_unreachable(launch)) from error
+    try:
         with contextlib.closing(bus):
             yield bus
     except StartError:
         refuse_ending(launch)
         raise
+
+
+def _unreachable(launch: RunningLaunch) -> str:
+    """Return what an operator has to know of a launch that runs, and whose bus can't be joined."""
+    if not runs(launch):
+        return f"{launch.run} has ended: its process {launch.pid} is gone"
+    waited = f"its bus does not answer within {_CONNECT_MS / 1000:.0f} s: nobody has been told anything"
+    has_agents = launch.identity is None or launch.identity.speaker.agents
+    advice = f". Its process lands all its agents: kill -INT {launch.pid}" if has_agents else ""
+    return f"{launch.run} runs, but {waited}{advice}"
 
 
 def vouchers(launch: RunningLaunch) -> Mapping[str, Set[int]]:

@@ -103,8 +103,19 @@ def test_a_verb_that_finds_a_launch_in_its_last_moment_says_that_it_is_ending(
             deliver(launch, Order("hold"), [])
         with pytest.raises(StartError, match=ENDING):
             read_obstacles(launch)
-    announce(launch)
-    with pytest.raises(StartError, match="no router answers"), joined(launch):
+
+
+def test_a_launch_whose_bus_does_not_answer_is_said_to_run_and_how_it_is_landed(
+    launch: RunningLaunch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That of a router which is stopped, for instance; who orders a landing must not be told to start a router."""
+    monkeypatch.setattr(operator, "join_bus", no_router)
+    land = rf"{launch.run} runs, but .* nobody has been told .* lands all its agents: kill -INT {launch.pid}"
+    with pytest.raises(StartError, match=land), joined(launch):
+        pass
+    monkeypatch.setattr(running_launches, "runs", lambda launch: False)
+    monkeypatch.setattr(operator, "runs", lambda launch: False)
+    with pytest.raises(StartError, match=f"{launch.run} has ended: its process {launch.pid} is gone"), joined(launch):
         pass
 
 
