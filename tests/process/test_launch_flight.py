@@ -415,6 +415,26 @@ def test_silence_after_the_last_agent_has_ended_is_no_sign_of_a_deaf_session(tmp
     assert '"bus_reopened"' not in (tmp_path / "launch.events.jsonl").read_text()
 
 
+def test_who_is_only_landed_by_another_process_flies_on_for_nobody_and_is_not_listened_for(tmp_path: Path) -> None:
+    """As of two agents of one process that is killed."""
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG])
+    assert scene.bus is not None
+    scene.bus = ReopeningBus(scene.bus, lambda: bool(scene.recovered))
+
+    def kill_both() -> None:
+        scene.kill("agent-0")
+        scene.kill("agent-1")
+        for i in (0, 1):
+            scene.children[agent_name(i)].wait(10.0)
+
+    scene.act = kill_both
+    scene.fly()
+    assert scene.recovered == [0, 1]
+    assert scene.printed("agent-1 was killed by SIGKILL")
+    assert not scene.printed("agent-1 was killed by SIGKILL; the others fly on")
+    assert not scene.printed("another session")
+
+
 def test_control_a_supervisor_that_believes_its_deaf_session_lands_its_agents(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -69,10 +69,10 @@ def _unreachable(launch: RunningLaunch) -> str:
     """Return what an operator has to know of a launch that runs, and whose bus can't be joined."""
     if not runs(launch):
         return f"{launch.run} has ended: its process {launch.pid} is gone"
-    waited = f"its bus does not answer within {_CONNECT_MS / 1000:.0f} s: nobody has been told anything"
     has_agents = launch.identity is None or launch.identity.speaker.agents
     advice = f". Its process lands all its agents: kill -INT {launch.pid}" if has_agents else ""
-    return f"{launch.run} runs, but {waited}{advice}"
+    waited_s = _CONNECT_MS / 1000
+    return f"{launch.run} runs, but its bus does not answer within {waited_s:.0f} s: nobody has been told{advice}"
 
 
 def vouchers(launch: RunningLaunch) -> Mapping[str, Set[int]]:

@@ -187,7 +187,7 @@ class FlightSupervisor:
             self._announce("obstacles", text, **recorded_list(adoption.after))
         for event, text in self._obstacles.news(adopted):
             self._announce(event, text)
-        self._report.step(anybody=bool(self._running()))
+        self._report.step(anybody=bool(self._flying()))
 
     def _watch_essential_processes(self) -> None:
         """Start a router again; land all agents when it ends again and again, or the simulator has ended."""
@@ -301,9 +301,10 @@ class FlightSupervisor:
 
     def _repeat_land_order(self, since_s: float) -> None:
         """Repeat the order on the bus, newly stamped, until every agent shows that it lands; later also by signal."""
-        running = (view for view in self._running() if not self._recovery.is_on(view.agent))
         deaf = [
-            view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND or view.status.held
+            view
+            for view in self._flying()
+            if view.status is None or view.status.phase < Phase.GOTO_LAND or view.status.held
         ]
         if deaf and len(self._views) == self._config.swarm.agents:
             self._order(Order("land"), deaf)
@@ -359,7 +360,7 @@ class FlightSupervisor:
                 self._refuse(f"{child.name} could not start: it {child.how_it_ended()}")
         else:
             view.note = "dead"
-            others = "; the others fly on" if self._running() else ""
+            others = "; the others fly on" if self._flying() else ""
             self._fail("agent_died", f"{child.name} {child.how_it_ended()}{others}")
 
     def _land(self, timeout_s: float) -> None:
@@ -369,9 +370,7 @@ class FlightSupervisor:
             self._land_ordered_s, self._land_until_s = now_s, now_s + timeout_s
             self._services.log.write("land")
         self._land_until_s = min(self._land_until_s, now_s + timeout_s)
-        for view in self._running():
-            if self._recovery.is_on(view.agent):
-                continue
+        for view in self._flying():
             if self._essential_lost or view.status is None or view.note == "silent":
                 self._services.children[agent_name(view.agent)].signal(signal.SIGTERM)
 
@@ -395,6 +394,10 @@ class FlightSupervisor:
 
     def _running(self) -> list[AgentView]:
         return [view for view, child in zip(self._views, self._agents(), strict=True) if child.poll() is None]
+
+    def _flying(self) -> list[AgentView]:
+        """Return those whose own agents still run: what lands the vehicle of another says nothing at first."""
+        return [view for view in self._running() if not self._recovery.is_on(view.agent)]
 
 
 def _end_of(child: Child) -> str:

@@ -110,7 +110,7 @@ def test_a_launch_whose_bus_does_not_answer_is_said_to_run_and_how_it_is_landed(
 ) -> None:
     """That of a router which is stopped, for instance; who orders a landing must not be told to start a router."""
     monkeypatch.setattr(operator, "join_bus", no_router)
-    land = rf"{launch.run} runs, but .* nobody has been told .* lands all its agents: kill -INT {launch.pid}"
+    land = rf"{launch.run} runs, but .* nobody has been told.* lands all its agents: kill -INT {launch.pid}"
     with pytest.raises(StartError, match=land), joined(launch):
         pass
     monkeypatch.setattr(running_launches, "runs", lambda launch: False)
