@@ -132,7 +132,8 @@ def view_address(launch: RunningLaunch) -> str:
         StartError: this launch has none.
     """
     if not launch.view:
-        raise StartError(f"view: {launch.run} serves none; it was started with telemetry.enabled = false, or just now")
+        why = "it was started with telemetry.enabled = false, or just now, or its viewer has ended"
+        raise StartError(f"view: {launch.run} serves none; {why}")
     return launch.view
 
 

@@ -17,7 +17,7 @@ class ViewerWatch:
     Args:
         child: the process; None without a view.
         tell: receives event, text and fields.
-        publish: receives the address of the live view, for the operator's `view`.
+        publish: receives the address of the live view, for the operator's `view`; "" once there is none any more.
         clock_s: monotonic time [s].
     """
 
@@ -42,6 +42,7 @@ class ViewerWatch:
             return
         if child.poll() is not None:
             self._tell("viewer_ended", f"view and recording stopped: viewer {child.how_it_ended()}; the flight goes on")
+            self._publish("")
             self._child = None
         elif self._awaited and (line := child.line_with(self._awaited[0])):
             self._take(line)

@@ -65,6 +65,16 @@ def test_a_viewer_that_freezes_before_it_serves_a_page_or_ends_is_told_once() ->
     assert scene.step() == ["view and recording stopped: viewer was killed; the flight goes on"]
 
 
+def test_the_address_of_a_viewer_that_has_ended_is_withdrawn() -> None:
+    """Or `view` opens a page on which nothing ever moves."""
+    scene = Scene()
+    scene.viewer.said = [f"viewer {LIVE}"]
+    scene.step()
+    scene.viewer.code = 137
+    scene.step()
+    assert scene.published == [LIVE, ""]
+
+
 def test_a_viewer_that_does_not_come_up_is_told_once_and_its_address_when_it_does() -> None:
     scene = Scene()
     scene.now_s += 19.0
