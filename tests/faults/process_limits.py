@@ -121,6 +121,19 @@ def descriptors_of_the_launcher_and_an_agent_dies(start: Start) -> None:
     launched.verdict()
 
 
+def run_folder_renamed_and_an_agent_dies(start: Start) -> None:
+    """What lands the vehicle reads its configuration, and records, where nobody has renamed anything."""
+    launched = tracking(start, *TWO, *NEAR, *SHORT)
+    elsewhere = launched.run_dir.with_name("renamed")
+    launched.run_dir.rename(elsewhere)
+    os.kill(agent_pid(launched), signal.SIGKILL)
+    code = launched.end()
+    elsewhere.rename(launched.run_dir)
+    require(code == 4, f"exit code {code}: {launched.text()[-600:]}")
+    require(launched.said("the vehicle of agent-1 is on the ground"), f"it is not landed: {launched.text()[-600:]}")
+    launched.verdict()
+
+
 class Piped(Bounded):
     """A launch whose output is read by another program, which may end."""
 

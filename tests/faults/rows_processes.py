@@ -29,6 +29,7 @@ from tests.faults.process_limits import (
     disk_full,
     ports_taken,
     reader_ends,
+    run_folder_renamed_and_an_agent_dies,
     vehicle_missing,
 )
 from tests.faults.row import Off
@@ -317,6 +318,20 @@ ROWS = (
         script=descriptors_of_the_launcher_and_an_agent_dies,
         readable=False,
         off=in_program("launch", RAISES),
+    ),
+    LaunchedRow(
+        name="process-run-folder-renamed-agent-killed",
+        event="the run folder is renamed in flight, and an agent is killed",
+        reaction="another process lands its vehicle, the verdict is printed",
+        within_s=90.0,
+        protection="what lands a vehicle needs no run folder",
+        script=run_folder_renamed_and_an_agent_dies,
+        readable=False,
+        off=in_program(
+            "launch",
+            "import swarmctl.ops.flight.launch as it\n"
+            "it.Launcher._recovery_folder = lambda self: self.context.directory / 'recovery'",
+        ),
     ),
     LaunchedRow(
         name="start-configuration-wrong",
