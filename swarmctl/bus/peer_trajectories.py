@@ -51,6 +51,7 @@ class PeerTrajectories:
         self.newest: dict[int, TrajectoryMessage] = {}
         self.telling: dict[int, TrajectoryMessage] = {}  # the newest of each peer that says what it has heard
         self.exclusions: dict[int, Exclusions] = {}  # of the newest message of each peer
+        self.far_from: set[int] = set()  # peers to which this agent is far, by their newest message
         self.received_utc_us: dict[int, int] = {}  # when the newest message of each peer was accepted
         self.confirmed_us: dict[int, int] = {}  # stamp of the newest own message that each peer says to have heard
         self.heard_before_flight: set[int] = set()  # peers that did not fly by commitments when first heard
@@ -73,6 +74,7 @@ class PeerTrajectories:
                 self.heard_before_flight.add(message.agent)
             self.newest[message.agent], self._memory[sender] = message, memory
             self.exclusions[message.agent] = message.exclusions
+            (self.far_from.add if self._agent in message.reach.far else self.far_from.discard)(message.agent)
             if message.heard or message.agent not in self.telling:
                 self.telling[message.agent] = message
             self.received_utc_us[message.agent] = utc_us

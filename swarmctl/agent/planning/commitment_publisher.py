@@ -82,7 +82,8 @@ class CommitmentPublisher:
         if not (for_all or is_new or utc_us >= self._sent_us + _ANSWERS_US):
             return
         newest = self._peers.newest
-        attentive = [agent for agent, i in newest.items() if self._agent not in i.reach.far or agent not in reach.far]
+        unheard = self._peers.far_from & reach.far
+        attentive = [agent for agent in newest if agent not in unheard]
         asking = {agent: newest[agent] for agent in attentive}
         if for_all:
             asking |= {agent: i for agent, i in newest.items() if i.proposal is not None and i.proposal.asks_far}

@@ -135,7 +135,7 @@ class Coordination:
         own, newest = self._commitments.trajectories, self._peer_trajectories.newest
         if not own or not self._far_peers.update(own, newest, utc_us):
             return
-        hears = self._far_peers.near | {agent for agent, i in newest.items() if self._agent not in i.reach.far}
+        hears = self._far_peers.near | (newest.keys() - self._peer_trajectories.far_from)
         if hears != self._hears:
             self._hears = hears
             self._bus.hear(topics.TRAJECTORY, [agent_name(agent) for agent in sorted(hears)])
@@ -349,9 +349,8 @@ class Coordination:
 
         One that was excluded while this agent was far from it may have committed to something unseen.
         """
-        newest, excluded = self._peer_trajectories.newest, self._membership.excluded
-        unseen = {agent for agent in excluded & newest.keys() if self._agent in newest[agent].reach.far}
-        return self._peers - (excluded - unseen) - self._ended - self._world_model.statuses.uncommitted
+        excluded = self._membership.excluded - self._peer_trajectories.far_from
+        return self._peers - excluded - self._ended - self._world_model.statuses.uncommitted
 
     def _absent(self) -> set[int]:
         """Return peers whose liveliness token is not on the bus."""
