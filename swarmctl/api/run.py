@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.recorded.records import PLAN_COLUMNS, TRUTH_COLUMNS
 from swarmctl.core.recorded.tick_record import COLUMNS
+from swarmctl.core.text import counted
 from swarmctl.errors import ConfigError
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.recording.file_names import SUMMARY
@@ -51,7 +52,7 @@ class Run:
 
     def __repr__(self) -> str:
         """Return the name of the folder, and how the run has ended."""
-        return f"<Run {self.folder.name}: {len(self.agents)} agents, {self.outcome}>"
+        return f"<Run {self.folder.name}: {counted(len(self.agents), 'agent')}, {self.outcome}>"
 
     @property
     def outcome(self) -> str:

@@ -18,6 +18,7 @@ import msgspec
 import psutil
 
 from swarmctl.bus.network.roster import OwnIdentity
+from swarmctl.core.text import counted
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
 from swarmctl.wall_clock import monotonic_us, utc_us
@@ -95,7 +96,7 @@ def find_launch(run: str | None) -> RunningLaunch:
     if len(found) == 1:
         return _flying(found[0])
     if found:
-        names = ", ".join(f"{launch.run} ({launch.agents} agents, {launch.run_dir})" for launch in found)
+        names = ", ".join(f"{launch.run} ({counted(launch.agents, 'agent')}, {launch.run_dir})" for launch in found)
         raise ConfigError("--run", [f"{len(found)} launches run, choose one by its name or folder: {names}"])
     if run is not None:
         known = ", ".join(f"{launch.run} ({launch.run_dir})" for launch in running) or "none"
