@@ -531,4 +531,4 @@ def test_obstacles_of_an_operator_are_adopted_and_repeated(tmp_path: Path) -> No
     assert [(judged.number, judged.obstacle) for judged in found] == [(0, ball), (1, ball), (0, column)]
     assert [judged.until_utc_us is None for judged in found] == [False, False, True], "what is gone was there"
     assert all(judged.since_utc_us == began_us for judged in found)
-    assert recorded_obstacles(configured, [{"event": "obstacles", "text": "1 obstacles"}]) == configured
+    assert recorded_obstacles(configured, [{"event": "obstacles", "text": "1 obstacle"}]) == configured

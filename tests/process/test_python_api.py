@@ -50,7 +50,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
 
 def test_what_the_page_shows_is_true(flown: tuple[Path, list[str]]) -> None:
     _, said = flown
-    assert said[0] == "<Run first: 1 agents, completed> []"
+    assert said[0] == "<Run first: 1 agent, completed> []"
     assert "agent-0 TRACK" in said
     (told,) = (line for line in said if line.startswith("mean "))
     mean_m, largest_m = (float(number) for number in re.findall(r"[\d.]+(?= m)", told))

@@ -240,6 +240,7 @@ def test_obstacles_of_the_operator_replace_the_first_ones(endpoint: str, tmp_pat
             message = obstacles_message(version, listed)
             swarm.session.put(f"swarm/{RUN}/operator/obstacles", message)
             swarm.fly(0.3)
+        until_at_rest(tmp_path / "telemetry.rrd")  # on a busy machine it is behind
         finish(process)
         swarm.session.close()
     centers = [

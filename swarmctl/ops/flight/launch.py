@@ -167,18 +167,16 @@ def _run_folder(config: Config, options: LaunchOptions) -> Iterator[Path]:
         yield directory
 
 
-def _private_folder(config: Config) -> Path:
-    """Make the folder, of mode 0700, of what has to outlive the run folder: sockets, and the configuration.
+def _private_folder() -> Path:
+    """Make the folder, of mode 0700, of sockets, and of what the run folder can't take any more.
 
     Raises:
         StartError: it can't be made.
     """
     try:
-        directory = Path(tempfile.mkdtemp(prefix="swarm-"))
-        (directory / CONFIG).write_text(dump(config), encoding="utf-8")
+        return Path(tempfile.mkdtemp(prefix="swarm-"))
     except OSError as error:
         raise StartError(f"temporary files can't be written: {error}. Make room, or choose another TMPDIR") from error
-    return directory
 
 
 class Launcher(Services):
@@ -193,7 +191,7 @@ class Launcher(Services):
         *,
         part: SwarmPart,
     ) -> None:
-        self._private_dir = _private_folder(config)
+        self._private_dir = _private_folder()
         self._config = config
         self._options = options
         self._reserved = reserved
@@ -285,9 +283,21 @@ class Launcher(Services):
         place = self.context.agents.index(agent)
         own = slice(place, place + 1)
         ends = self._reserved.sockets[own], self._reserved.vehicle_sockets[own]
-        config_path = self._private_dir / CONFIG
+        config_path = self._recovery_config()
         (command,) = agent_commands(self._config, context, *ends, config_path=config_path)
         return Child(replace(command, argv=(*command.argv, "--only-land", *self._originals(agent))), directory)
+
+    def _recovery_config(self) -> Path:
+        """Return where the configuration is; it is written anew where the run folder is gone.
+
+        Raises:
+            OSError: it can't be.
+        """
+        path = self.context.directory / CONFIG
+        if not path.is_file():
+            path = self._private_dir / CONFIG
+            path.write_text(dump(self._config), encoding="utf-8")
+        return path
 
     def _recovery_folder(self) -> Path:
         """Return where what lands a vehicle records: not in the run folder where that takes nothing, or is gone."""
