@@ -331,11 +331,12 @@ def _overrides(agents: int | None, duration: float | None, seed: int | None, set
 
 
 def _show(launch: RunningLaunch, statuses: dict[int, StatusMessage], gone: Collection[int]) -> None:
+    from swarmctl.ops.orders.operator import HAS_ENDED
     from swarmctl.ops.supervision.status_table import AgentView, print_statuses
 
     print(f"status: {launch.run}", file=sys.stderr)  # rows alone on standard output
     views = [AgentView(agent=number, status=statuses.get(number)) for number in range(launch.agents)]
     for view in views:
         if view.status is None:
-            view.note = "has ended, its vehicle is on the ground" if view.agent in gone else "not heard"
+            view.note = HAS_ENDED if view.agent in gone else "not heard"
     print_statuses(views, launch.run)

@@ -26,6 +26,7 @@ from swarmctl.wall_clock import monotonic_us
 
 ANSWER_S = 5.0  # longest wait for what is asked over the bus
 REPEAT_S = 0.2
+HAS_ENDED = "has ended, its vehicle is on the ground"  # of whom `GoneAgents` has
 _CONNECT_MS = 3000
 _UNHEARD_US = 1_000_000  # after which an agent that has ended counts as gone: another process would have been heard
 
@@ -162,9 +163,10 @@ def read_agents(launch: RunningLaunch) -> tuple[dict[int, StatusMessage], frozen
 
 def watch_statuses(launch: RunningLaunch, every_s: float) -> Iterator[dict[int, StatusMessage]]:
     """Yield the statuses that have arrived since the last time, by agent, until the launch ends."""
+    gone = GoneAgents(vouchers(launch))
     with joined(launch) as bus:
         while runs(launch):
-            yield _statuses(bus, range(launch.agents), 0.0)
+            yield _statuses(bus, range(launch.agents), 0.0, gone)
             time.sleep(every_s)
 
 
@@ -178,7 +180,7 @@ def vector(key: str, text: str, problems: list[str]) -> tuple[float, float, floa
     return (north, east, down)
 
 
-def _statuses(bus: Bus, agents: range, timeout_s: float, gone: GoneAgents | None = None) -> dict[int, StatusMessage]:
+def _statuses(bus: Bus, agents: range, timeout_s: float, gone: GoneAgents) -> dict[int, StatusMessage]:
     """Return the newest status of each of `agents`, once all but those gone have published one or the time is up."""
     heard: dict[int, StatusMessage] = {}
     deadline_s = time.monotonic() + timeout_s
@@ -187,11 +189,9 @@ def _statuses(bus: Bus, agents: range, timeout_s: float, gone: GoneAgents | None
             status = decode_status(payload)
             if status is not None and status.agent in agents and sender == agent_name(status.agent):
                 heard[status.agent] = status
-                if gone is not None:
-                    gone.hear(status.agent)
-        if gone is not None:
-            gone.receive(bus, monotonic_us())
-        missing = [agent for agent in agents if agent not in heard and not (gone is not None and gone.has(agent))]
+                gone.hear(status.agent)
+        gone.receive(bus, monotonic_us())
+        missing = [agent for agent in agents if agent not in heard and not gone.has(agent)]
         if not missing or time.monotonic() >= deadline_s:
             break
         time.sleep(0.02)

@@ -20,12 +20,12 @@ from swarmctl.core.operator_verbs import OPERATOR_VERBS, PEER, Answer, Order
 from swarmctl.core.text import printable
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.ops.orders.operator import ANSWER_S, REPEAT_S, GoneAgents, joined, vouchers
+from swarmctl.ops.orders.operator import ANSWER_S, HAS_ENDED, REPEAT_S, GoneAgents, joined, vouchers
 from swarmctl.ops.running_launches import RunningLaunch, refuse_ending
 
 _POLL_S = 0.02
 _IS_DOWN = Phase.DONE.name  # what is obeyed in this phase asks nothing of a vehicle on the ground
-_GONE = "it has ended, its vehicle is on the ground"
+_GONE = f"it {HAS_ENDED}"
 _MOST_MESSAGES = 32  # of one repetition, so that they fit into an agent's ring
 
 
