@@ -23,7 +23,7 @@ OWN_COMPID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER, beside the vehicle's own syste
 _RETRY_US = 500_000
 _TRIES = 4
 _IN_PROGRESS = 5  # MAV_RESULT
-_HEARTBEAT_US = 1_000_000
+_HEARTBEAT_US = 200_000  # autopilots that count from the newest one fly on for a time that is known so well
 HEARD = frozenset(  # ids of the messages that answer a command
     (mavlink.MAVLINK_MSG_ID_COMMAND_ACK, mavlink.MAVLINK_MSG_ID_PARAM_VALUE, mavlink.MAVLINK_MSG_ID_PARAM_ERROR)
 )
