@@ -46,6 +46,7 @@ from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import (
     FLOWN_BY_AGENT,
     NO_TIMES,
+    Array,
     AttitudeSetpoint,
     FlightMode,
     Mode,
@@ -210,7 +211,8 @@ class Agent:
         flown = self._decide(now_us, state, planning)
         setpoint = self._act(now_us, state, flown, planning)
         self.timing = self._timing(began_ns, sensed_ns, planned_ns, stopwatch_ns(), planning.plan)
-        self._share(now_us, state, flown)
+        setpoint_accel_ned_m_s2 = None if setpoint is None else self._own_state.setpoint_accel_ned_m_s2
+        self._share(now_us, state, flown, setpoint_accel_ned_m_s2)
         self._advance(now_us, state)
         self._report_refusals(now_us)
         self._publisher.active_alert = self._alerts.newest(now_us)
@@ -219,7 +221,11 @@ class Agent:
             state,
             planning,
             ControlOutput(
-                mode=self._modes.mode, flown=flown, setpoint=setpoint, safety_filter_acted=self._safety_filter.acts
+                mode=self._modes.mode,
+                flown=flown,
+                setpoint=setpoint,
+                setpoint_accel_ned_m_s2=setpoint_accel_ned_m_s2,
+                safety_filter_acted=self._safety_filter.acts,
             ),
             mission=self._mission,
             estimate=self._own_state.estimate,
@@ -309,7 +315,9 @@ class Agent:
             self._deadlines.sent(now_us)
         return setpoint
 
-    def _share(self, now_us: int, state: VehicleState | None, flown: Plan | None) -> None:
+    def _share(
+        self, now_us: int, state: VehicleState | None, flown: Plan | None, setpoint_accel_ned_m_s2: Array | None
+    ) -> None:
         """Publish the predicted path, and what the separation policy has to say."""
         jump_m, accuracy_m = self._ports.autopilot.frame.margin_m, self._vehicle_watch.accuracy.margin_m
         self._path_publisher.publish(
@@ -317,6 +325,7 @@ class Agent:
             state,
             flown,
             self._publisher.seq,
+            setpoint_accel_ned_m_s2=setpoint_accel_ned_m_s2,
             disturbance_ned_m_s2=self._own_state.estimate.disturbance_ned_m_s2,
             margins_m=(jump_m, accuracy_m, self._deadlines.margin_m, self._planner.directive.margin_m),
             as_committed=self._planner.directive.as_committed,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.mpc.problem import Start
-from swarmctl.core.types import AttitudeSetpoint, Mode, Plan, Reference
+from swarmctl.core.types import Array, AttitudeSetpoint, Mode, Plan, Reference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,4 +26,5 @@ class ControlOutput:
     mode: Mode
     flown: Plan | None
     setpoint: AttitudeSetpoint | None
+    setpoint_accel_ned_m_s2: Array | None  # (3,) that the setpoint asks for
     safety_filter_acted: bool = False

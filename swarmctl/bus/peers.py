@@ -94,6 +94,7 @@ class PeerPaths:
             dt_us=path.dt_us,
             margin_m=min(MAX_MARGIN_M, path.margin_m + spread_us * fastest_m_us),
             pos_ned_m=path.pos_ned_m,
+            setpoint_accel_ned_m_s2=path.setpoint_accel_ned_m_s2,
         )
 
     def latest(self) -> tuple[PredictedPath, ...]:

@@ -170,6 +170,7 @@ class PredictedPath:
     dt_us: int
     margin_m: float  # what peers keep on top of the swarm's required separation
     pos_ned_m: Array  # (N+1, 3)
+    setpoint_accel_ned_m_s2: Array | None = None  # (3,) that its last setpoint asks for, drag aside; None: it gets none
 
 
 @dataclass(frozen=True, slots=True)

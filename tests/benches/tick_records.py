@@ -66,6 +66,7 @@ def tick_record(**changes: Any) -> TickRecord:
         "plan": PLAN,
         "flown": PLAN,
         "setpoint": AttitudeSetpoint(np.array([1.0, 0.0, 0.125, 0.0]), 0.625, 0),
+        "setpoint_accel_ned_m_s2": np.array([0.25, -0.5, 0.125]),
         "hover_thrust_01": 0.375,
         "disturbance_ned_m_s2": np.array([0.0625, -0.5, 2.0]),
         "nearest_peer_m": math.inf,

@@ -6,7 +6,7 @@ import numpy as np
 
 from swarmctl.control.estimation.disturbance import DisturbanceObserver, Estimate
 from swarmctl.control.estimation.state_filter import StateFilter
-from swarmctl.control.model import Predictor, VehicleModelParams
+from swarmctl.control.model import Predictor, VehicleModelParams, acceleration
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.types import Array, FlightMode, VehicleState
@@ -37,6 +37,11 @@ class OwnState:
     def estimate(self) -> Estimate:
         """Return the newest estimate of disturbance and hover thrust."""
         return self._estimator.estimate
+
+    @property
+    def setpoint_accel_ned_m_s2(self) -> Array:
+        """Return the acceleration (3,) that the last setpoint asks for, with what disturbs the vehicle, drag aside."""
+        return acceleration(self._virtual_control) + self._estimator.estimate.disturbance_ned_m_s2
 
     def update(self, state: VehicleState, hover_thrust_01: float | None, *, controls: bool) -> None:
         """Take in the newest state, which may be that of the last tick.

@@ -27,6 +27,8 @@ from swarmctl.core.types import MAX_MARGIN_M, Array, FlightMode, Plan, Predicted
 
 _DOUBT_US = 600_000  # ahead, over which two ways of a vehicle are compared: they part by metres, and are told anew
 _COMMITTED_EVERY_US = 60_000  # peers compare such paths while they are newer than 0.3 s: one in five suffices
+_TOLD_M = 0.3  # by which peers may misplace it when it rests, because they do not know its last setpoint
+_BRAKING_S = 0.5  # in which it moves on at the speed that it has when its autopilot brakes, about
 
 
 class PathPublisher:
@@ -54,6 +56,7 @@ class PathPublisher:
         self._lag_s, self._drag_1_s = setup.vehicle_model.lag_s, setup.vehicle_model.drag_1_s
         self._gust, self._stop_judge = GustWatch(), StopJudge()
         self._published_us, self._margin_m = -_COMMITTED_EVERY_US, 0.0
+        self._told_accel_ned_m_s2: Array | None = None
         self._flown: tuple[Plan, int] | None = None  # newest plan that was flown, and when its last setpoint acts
         self._far = FarPaths(setup.params.path_sharing)
 
@@ -64,6 +67,7 @@ class PathPublisher:
         flown: Plan | None,
         seq: int,
         *,
+        setpoint_accel_ned_m_s2: Array | None,
         disturbance_ned_m_s2: Array,
         margins_m: Iterable[float],
         as_committed: bool,
@@ -75,6 +79,7 @@ class PathPublisher:
             state: newest state.
             flown: plan that is flown, None when the autopilot flies.
             seq: number of the tick.
+            setpoint_accel_ned_m_s2: (3,) that the setpoint of this tick asks for; None if none has left.
             disturbance_ned_m_s2: (3,) estimate.
             margins_m: what peers have to keep more, for each reason there is besides gusts.
             as_committed: peers know what is flown from what has been committed to, and compare it with the path.
@@ -87,14 +92,26 @@ class PathPublisher:
             return
         margin_m = ordered_sum((*margins_m, self._gust.margin_m))
         is_known = as_committed and flown is not None and margin_m == self._margin_m
+        is_known = is_known and self._is_as_told(setpoint_accel_ned_m_s2)
         if is_known and now_us - self._published_us < _COMMITTED_EVERY_US:
             return
-        self._published_us, self._margin_m = now_us, margin_m
-        path = self._path(now_us, state, flown, seq, margin_m)
+        self._published_us, self._margin_m, self._told_accel_ned_m_s2 = now_us, margin_m, setpoint_accel_ned_m_s2
+        path = self._path(now_us, state, flown, seq, margin_m, setpoint_accel_ned_m_s2)
         for_all = self._far.include(path, now_us)
         message = self._sharing.message(path, for_all=for_all)
         if message is not None:
             self._ports.bus.publish(topics.FAR_PATH if for_all else topics.PATH, message)
+
+    def _is_as_told(self, accel_ned_m_s2: Array | None) -> bool:
+        """Return whether peers know what the setpoint asks for, should it be the last one that the vehicle gets."""
+        told, autopilot = self._told_accel_ned_m_s2, self._ports.autopilot
+        keeps_s, coasts_s = autopilot.setpoint_loss_s, autopilot.landing_delay_s
+        if accel_ned_m_s2 is None and told is None:
+            return True
+        if accel_ned_m_s2 is None or told is None or keeps_s is None or coasts_s is None:
+            return False
+        moves_s2 = keeps_s * (coasts_s - 0.5 * keeps_s + _BRAKING_S)  # m for each m/s2 that is kept
+        return math.dist(accel_ned_m_s2.tolist(), told.tolist()) * moves_s2 <= _TOLD_M
 
     @property
     def told_m_s(self) -> float:
@@ -113,7 +130,15 @@ class PathPublisher:
         brakes_s = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)) / BRAKE_M_S2 + ANSWER_S
         return now_us - state.t_us <= (coasts_s + brakes_s) * 1e6
 
-    def _path(self, now_us: int, state: VehicleState, flown: Plan | None, seq: int, margin_m: float) -> PredictedPath:
+    def _path(
+        self,
+        now_us: int,
+        state: VehicleState,
+        flown: Plan | None,
+        seq: int,
+        margin_m: float,
+        accel_ned_m_s2: Array | None,
+    ) -> PredictedPath:
         if flown is not None:
             self._stop_judge.forget()
             self._flown = flown, now_us + self._delay_us
@@ -122,6 +147,7 @@ class PathPublisher:
             if heard_us is not None:
                 pos, apart_m = self._unheard(state, flown, heard_us)
                 margin_m += apart_m
+                accel_ned_m_s2 = None  # of a setpoint that may not have arrived
         else:
             t0_us, dt_us = now_us + self._delay_us, self._dt_us
             if self._is_recent(now_us, state):
@@ -141,6 +167,7 @@ class PathPublisher:
             dt_us=dt_us,
             margin_m=min(MAX_MARGIN_M, margin_m),
             pos_ned_m=pos,
+            setpoint_accel_ned_m_s2=None if flown is None else accel_ned_m_s2,
         )
 
     def _without_link(self, state: VehicleState, t0_us: int) -> tuple[Array, float]:

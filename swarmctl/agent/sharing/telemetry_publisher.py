@@ -97,6 +97,7 @@ class TelemetryPublisher:
             plan=planning.plan,
             flown=output.flown,
             setpoint=output.setpoint,
+            setpoint_accel_ned_m_s2=output.setpoint_accel_ned_m_s2,
             hover_thrust_01=estimate.hover_thrust_01,
             disturbance_ned_m_s2=estimate.disturbance_ned_m_s2,
             nearest_peer_m=min(peers, default=math.inf),

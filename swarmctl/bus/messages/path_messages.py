@@ -2,7 +2,7 @@
 
 Compact points are whole multiples of a unit, a power of two between 15 micrometres and a millimetre: the first one, the
 first step, and by how much each step differs from the one before, a signed byte for each axis. Those differences are
-the acceleration, which is small where positions are not: 41 points take 177 bytes, as float32 528.
+the acceleration, which is small where positions are not: 41 points take 183 bytes, as float32 534.
 
 A field more in the header is a new version, which receivers that do not know it refuse.
 """
@@ -17,12 +17,12 @@ import numpy as np
 
 from swarmctl.core.types import MAX_MARGIN_M, Array, PredictedPath
 
-FLOAT_VERSION = 1
-COMPACT_VERSION = 2
+FLOAT_VERSION = 3
+COMPACT_VERSION = 4
 MAX_POINTS = 250
 _HEADER = struct.Struct(
-    "<2sBBIIIqifBBbx"
-)  # magic, version, flags, agent, boot, seq, t0, dt, margin, points, own length, exponent of the unit
+    "<2sBBIIIqifBBbx3h"
+)  # magic, version, flags, agent, boot, seq, t0, dt, margin, points, own length, exponent of the unit, acceleration
 _MAGIC = b"SP"
 _NUMBER = np.dtype("<f4")
 _BEGIN, _BEND = np.dtype("<i4"), np.dtype("i1")
@@ -31,6 +31,10 @@ _FINEST, _COARSEST = -16, -10  # exponents
 _FARTHEST_M = 2.0 ** (30 + _FINEST)  # 16 km; a step may be twice as long
 _LARGEST_BEND = 125  # units; two fewer than fit, by which rounding positions may change a difference of steps
 _REMEMBERED = 256  # paths: two of each of a hundred agents, which all hear within a tick
+_HAS_SETPOINT = 1  # flag
+_PER_M_S2 = 1024.0  # units of accelerations; 32 m/s2 are the most
+_MOST_ACCEL = 32767
+_NO_ACCEL = (0, 0, 0)
 _ROUNDING_01 = 0.5 * math.sqrt(3.0)  # largest distance, in units, of a point from its rounded one
 
 
@@ -58,7 +62,7 @@ def _header(path: PredictedPath, version: int, margin_m: float, exponent: int) -
     return _HEADER.pack(
         _MAGIC,
         version,
-        0,
+        0 if path.setpoint_accel_ned_m_s2 is None else _HAS_SETPOINT,
         path.agent,
         path.boot_id,
         path.seq,
@@ -68,7 +72,17 @@ def _header(path: PredictedPath, version: int, margin_m: float, exponent: int) -
         len(path.pos_ned_m),
         _HEADER.size,
         exponent,
+        *_accel_units(path.setpoint_accel_ned_m_s2),
     )
+
+
+def _accel_units(accel_ned_m_s2: Array | None) -> tuple[int, int, int]:
+    """Return an acceleration (3,) in units; that of float32, as it is recorded, so that both are rounded alike."""
+    if accel_ned_m_s2 is None:
+        return _NO_ACCEL
+    units = accel_ned_m_s2.astype(_NUMBER).astype(np.float64) * _PER_M_S2
+    north, east, down = (round(max(-_MOST_ACCEL, min(_MOST_ACCEL, unit))) for unit in units.tolist())
+    return north, east, down
 
 
 def _exponent(pos_ned_m: Array) -> int | None:
@@ -96,7 +110,7 @@ def decode_path(payload: bytes) -> PredictedPath | None:
     """
     if len(payload) < _HEADER.size:
         return None
-    (magic, version, _, agent, boot_id, seq, t0_utc_us, dt_us, margin_m, count, header_len, exponent) = (
+    (magic, version, flags, agent, boot_id, seq, t0_utc_us, dt_us, margin_m, count, header_len, exponent, *accel) = (
         _HEADER.unpack_from(payload)
     )
     if magic != _MAGIC or header_len < _HEADER.size or dt_us <= 0 or not 2 <= count <= MAX_POINTS:
@@ -120,6 +134,7 @@ def decode_path(payload: bytes) -> PredictedPath | None:
         dt_us=dt_us,
         margin_m=margin_m,
         pos_ned_m=pos_ned_m,
+        setpoint_accel_ned_m_s2=np.array(accel) / _PER_M_S2 if flags & _HAS_SETPOINT else None,
     )
 
 

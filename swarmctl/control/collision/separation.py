@@ -226,16 +226,27 @@ def without_setpoints(
     coasts_s = keeps_s if coasts_s is None else max(keeps_s, coasts_s)
     lag = max(0, min(round(min(lag_s, keeps_s) / dt_s), len(path.pos_ned_m) - 3))
     first, second = path.pos_ned_m[lag : lag + 2]
-    bend = path.pos_ned_m[lag + 2] - 2.0 * second + first if len(path.pos_ned_m) > 2 else np.zeros(3)
-    bend[2] = 0.0
-    most_m, size_m = _MOST_M_S2 * dt_s**2, math.hypot(bend[0], bend[1])
-    bend *= most_m / max(size_m, most_m)
-    accel = bend / dt_s**2
+    accel = _level_accel_ned_m_s2(path, lag)
     vel = (second - first) / dt_s - 0.5 * dt_s * accel  # at the first point
+    if path.setpoint_accel_ned_m_s2 is not None:
+        accel = path.setpoint_accel_ned_m_s2 - drag_1_s * vel
+        accel[2] = 0.0
     ahead_s = grid(max(1, round(_STOPS_US / path.dt_us) - lag)) * dt_s
     limits = {"keeps_s": keeps_s - lag * dt_s, "coasts_s": coasts_s - lag * dt_s, "drag_1_s": drag_1_s}
     pos = without_setpoints_ned_m(first, vel, accel, ahead_s, **limits)
     return replace(path, pos_ned_m=np.concatenate((path.pos_ned_m[:lag], pos)) if lag else pos)
+
+
+def _level_accel_ned_m_s2(path: PredictedPath, step: int) -> Array:
+    """Return the acceleration (3,) in the plane that was planned at a point, by the bend of the path there."""
+    if len(path.pos_ned_m) < 3:
+        return np.zeros(3)
+    first, second, third = path.pos_ned_m[step : step + 3]
+    bend, dt_s = third - 2.0 * second + first, path.dt_us * 1e-6
+    bend[2] = 0.0
+    most_m, size_m = _MOST_M_S2 * dt_s**2, math.hypot(bend[0], bend[1])
+    bend *= most_m / max(size_m, most_m)
+    return np.asarray(bend / dt_s**2)
 
 
 def keep_out_of_peer(

@@ -68,6 +68,7 @@ class TickRecord:
     plan: Plan | None  # the plan of this tick
     flown: Plan | None  # the plan whose input was sent, possibly an earlier one
     setpoint: AttitudeSetpoint | None  # None when none was sent
+    setpoint_accel_ned_m_s2: Array | None  # (3,) that it asks for, drag aside; None when none was sent
     hover_thrust_01: float
     disturbance_ned_m_s2: Array  # (3,)
     nearest_peer_m: float  # inf without peers
@@ -349,6 +350,14 @@ COLUMNS = (
         names=ControlMode,
         value=lambda tick: tick.control,
         absent=NOT_RECORDED,
+    ),
+    Column(
+        name="setpoint_accel_ned_m_s2",
+        dtype=_F4,
+        size=3,
+        unit="m/s2",
+        text="acceleration that the setpoint sent asks for, drag aside; NaN when none was",
+        value=lambda tick: tick.setpoint_accel_ned_m_s2,
     ),
 )
 CURVES = {column.name: column.view for column in COLUMNS if isinstance(column.view, Curve)}

@@ -228,7 +228,7 @@ def _paths(
     model = config.model_of(peer)
     delay_us, stop_judge, brake_m_s2 = Predictor(model).delay_us, StopJudge(), config.separation.brake_m_s2
     for row, begin_us in zip(rows, begins_utc_us(rows).tolist(), strict=True):
-        t_us = int(row["t_us"])
+        t_us, accel = int(row["t_us"]), row["setpoint_accel_ned_m_s2"]
         if t_us in planned:
             stop_judge.forget()
             at_us, pos = planned[t_us]["at_us"], planned[t_us]["pos_ned_m"].astype(np.float64)
@@ -249,6 +249,7 @@ def _paths(
             dt_us=int(at_us[1] - at_us[0]),
             margin_m=0.0,
             pos_ned_m=pos,
+            setpoint_accel_ned_m_s2=accel if t_us in planned and np.isfinite(accel).all() else None,
         )
 
 

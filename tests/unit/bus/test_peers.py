@@ -69,8 +69,11 @@ def test_a_path_gets_room_for_the_error_of_its_clock() -> None:
     assert store.paths.latest()[0].margin_m == path.margin_m, "not measured"
     clocks.received(1, NOW_US, NOW_US + 30_000)
     clocks.answered(1, NOW_US, NOW_US + 30_000, NOW_US + 40_000)
-    store.offer(encode_path(replace(path, seq=2)))
-    assert store.paths.latest()[0].margin_m == pytest.approx(path.margin_m + 0.03 * 2.5, rel=1e-3)
+    asked = np.array([1.0, 0.0, 0.5])
+    store.offer(encode_path(replace(path, seq=2, setpoint_accel_ned_m_s2=asked)))
+    (found,) = store.paths.latest()
+    assert found.margin_m == pytest.approx(path.margin_m + 0.03 * 2.5, rel=1e-3)
+    np.testing.assert_array_equal(found.setpoint_accel_ned_m_s2, asked)
 
 
 def test_that_room_is_for_where_the_peer_is_fastest() -> None:

@@ -6,6 +6,7 @@ import math
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -100,13 +101,20 @@ def test_a_path_survives_encoding() -> None:
 
 def test_bytes_of_a_path_parsed_by_hand() -> None:
     payload = encode_path(path())
-    assert payload[:4] == b"SP\x01\x00"
+    assert payload[:4] == b"SP\x03\x00"
     assert struct.unpack_from("<III", payload, 4) == (4, 0xFFFFFFFF, 123_456)
     assert struct.unpack_from("<q", payload, 16) == (UTC_US,)
     assert struct.unpack_from("<if", payload, 24) == (20_000, 0.5)
-    assert payload[32:36] == bytes([3, 36, 0, 0])
-    assert struct.unpack_from("<9f", payload, 36) == tuple(POINTS.ravel())
-    assert len(payload) == 36 + 9 * 4
+    assert payload[32:36] == bytes([3, 42, 0, 0])
+    assert payload[36:42] == bytes(6)
+    assert struct.unpack_from("<9f", payload, 42) == tuple(POINTS.ravel())
+    assert len(payload) == 42 + 9 * 4
+
+
+def test_an_acceleration_follows_as_a_flag_says() -> None:
+    payload = encode_path(replace(path(), setpoint_accel_ned_m_s2=np.array([1.0, -2.0, 0.5])))
+    assert payload[3] == 1
+    assert struct.unpack_from("<3h", payload, 36) == (1024, -2048, 512)
 
 
 def changed(offset: int, code: str, value: float) -> bytes:
@@ -118,18 +126,18 @@ def changed(offset: int, code: str, value: float) -> bytes:
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("number", range(9))
 def test_a_number_that_is_not_finite_is_refused(number: int, bad: float) -> None:
-    assert decode_path(changed(36 + 4 * number, "<f", bad)) is None
+    assert decode_path(changed(42 + 4 * number, "<f", bad)) is None
 
 
 @pytest.mark.parametrize(
     "payload",
     [
         b"",
-        encode_path(path())[:35],
+        encode_path(path())[:41],
         encode_path(path())[:-1],
         encode_path(path()) + b"\x00",
         changed(0, "<B", ord("X")),
-        changed(2, "<B", 3),  # a version from the future
+        changed(2, "<B", 5),  # a version from the future
         changed(24, "<i", 0),  # dt
         changed(24, "<i", -20_000),
         changed(28, "<f", math.nan),  # radius
@@ -138,7 +146,7 @@ def test_a_number_that_is_not_finite_is_refused(number: int, bad: float) -> None
         changed(28, "<f", MAX_MARGIN_M + 0.01),
         changed(32, "<B", 2),  # count
         changed(32, "<B", 4),
-        changed(33, "<B", 35),  # header length
+        changed(33, "<B", 41),  # header length
         changed(33, "<B", 0),
         changed(32, "<H", 4 | 24 << 8),  # four points from within the header: the length would fit
         encode_path(path(POINTS[:1])),
@@ -157,8 +165,8 @@ def test_limits_of_the_number_of_points_are_inclusive(count: int) -> None:
 
 
 def test_a_longer_header_of_a_later_minor_version_is_skipped() -> None:
-    payload = changed(33, "<B", 44)
-    decoded = decode_path(payload[:36] + b"\xff" * 8 + payload[36:])
+    payload = changed(33, "<B", 50)
+    decoded = decode_path(payload[:42] + b"\xff" * 8 + payload[42:])
     assert decoded is not None
     np.testing.assert_array_equal(decoded.pos_ned_m, POINTS)
 
@@ -169,7 +177,7 @@ def test_hostile_bytes_give_none(payload: bytes) -> None:
         assert decode(payload) is None
 
 
-@given(st.binary(min_size=68, max_size=68), st.integers(0, 40))
+@given(st.binary(min_size=74, max_size=74), st.integers(0, 40))
 def test_hostile_bodies_behind_a_good_beginning_give_a_sane_path_or_none(tail: bytes, keep: int) -> None:
     good = encode_path(path())
     decoded = decode_path(good[: 4 + keep] + tail[: len(good) - 4 - keep])

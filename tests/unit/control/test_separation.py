@@ -105,6 +105,20 @@ def test_without_setpoints_a_turn_goes_on_until_the_attitude_is_that_of_the_last
     np.testing.assert_array_equal(without_setpoints(path, lag_s=0.0).pos_ned_m, without_setpoints(path).pos_ned_m)
 
 
+@pytest.mark.parametrize("drag_1_s", [0.0, 1.0])
+def test_without_setpoints_what_the_last_setpoint_asks_for_is_kept_where_that_is_told(drag_1_s: float) -> None:
+    """It is of one tick; the path goes on as setpoints would that are never sent."""
+    t_s = 0.05 * np.arange(41)
+    brakes = np.stack([2.0 * t_s - 0.5 * t_s**2, np.zeros(41), np.full(41, -2.0)], axis=1)
+    told = replace(peer(brakes), dt_us=50_000, setpoint_accel_ned_m_s2=np.array([0.0, 3.0, 1.0]))
+    flown = without_setpoints(told, lag_s=0.2, drag_1_s=drag_1_s).pos_ned_m
+    np.testing.assert_array_equal(flown[:5], brakes[:5])
+    acceleration = np.diff(flown[4:10], n=2, axis=0) / 0.05**2
+    vel = np.diff(flown[4:10], axis=0)[:-1] / 0.05
+    np.testing.assert_allclose(acceleration[:, :2], [0.0, 3.0] - drag_1_s * vel[:, :2], atol=0.15)
+    np.testing.assert_allclose(flown[:, 2], -2.0, atol=1e-12)
+
+
 def test_without_setpoints_an_autopilot_that_takes_over_late_keeps_the_attitude_and_flies_on_level() -> None:
     """As an ArduCopter: GUID_TIMEOUT 1 s, FS_GCS_TIMEOUT 2 s."""
     t_s = np.arange(6) * (DT_US * 1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,13 +57,33 @@ def sent(points: Array, margin_m: float = MARGIN_M) -> PredictedPath:
     return decoded
 
 
+@pytest.mark.parametrize("compact", [False, True])
+def test_what_a_setpoint_asks_for_is_told_in_both_ways(compact: bool) -> None:
+    asked = np.array([-3.2, 0.0004, 11.7])
+    told = replace(path(CIRCLE), setpoint_accel_ned_m_s2=asked)
+    payload = encode_path(told, compact=compact)
+    decoded = decode_path(payload)
+    assert decoded is not None and decoded.setpoint_accel_ned_m_s2 is not None
+    np.testing.assert_allclose(decoded.setpoint_accel_ned_m_s2, asked, atol=2.0**-11)
+    as_recorded = replace(told, setpoint_accel_ned_m_s2=asked.astype(np.float32))
+    assert encode_path(as_recorded, compact=compact) == payload
+    without = decode_path(encode_path(path(CIRCLE), compact=compact))
+    assert without is not None and without.setpoint_accel_ned_m_s2 is None
+
+
+def test_an_acceleration_beyond_what_fits_is_told_as_the_largest() -> None:
+    decoded = decode_path(encode_path(replace(path(CIRCLE), setpoint_accel_ned_m_s2=np.array([-90.0, 90.0, 0.0]))))
+    assert decoded is not None and decoded.setpoint_accel_ned_m_s2 is not None
+    np.testing.assert_allclose(decoded.setpoint_accel_ned_m_s2, [-32.0, 32.0, 0.0], atol=0.01)
+
+
 def rounded_m(points: Array, decoded: PredictedPath) -> float:
     return float(np.linalg.norm(decoded.pos_ned_m - points, axis=1).max())
 
 
 def test_forty_steps_take_less_than_two_hundred_bytes() -> None:
-    assert len(encode_path(path(CIRCLE), compact=True)) == 177
-    assert len(encode_path(path(CIRCLE))) == 528
+    assert len(encode_path(path(CIRCLE), compact=True)) == 183
+    assert len(encode_path(path(CIRCLE))) == 534
 
 
 @pytest.mark.parametrize("compact", [True, False])
@@ -152,7 +173,7 @@ def changed(offset: int, code: str, value: int) -> bytes:
         changed(34, "<b", -17),  # exponent
         changed(34, "<b", -9),
         changed(34, "<b", 127),
-        changed(32, "<B", 2)[: 36 + 24],
+        changed(32, "<B", 2)[: 42 + 24],
     ],
 )
 def test_malformed_compact_paths_are_refused(payload: bytes) -> None:
@@ -161,6 +182,6 @@ def test_malformed_compact_paths_are_refused(payload: bytes) -> None:
 
 @given(st.binary(min_size=24 + 117, max_size=24 + 117))
 def test_hostile_bodies_give_a_finite_path(body: bytes) -> None:
-    decoded = decode_path(encode_path(path(CIRCLE), compact=True)[:36] + body)
+    decoded = decode_path(encode_path(path(CIRCLE), compact=True)[:42] + body)
     assert decoded is not None
     assert np.isfinite(decoded.pos_ned_m).all()
