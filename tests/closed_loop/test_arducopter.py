@@ -9,8 +9,9 @@ import pytest
 
 from sitl.arducopter.autopilot import ArduCopter
 from sitl.lockstep import Lockstep
+from swarmctl.agent.planning.non_participants import NonParticipants
 from swarmctl.agent.sensing import world_model
-from swarmctl.control.collision.separation import without_setpoints
+from swarmctl.control.collision.separation import KeepOuts, without_setpoints
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from tests.closed_loop.conftest import Flight, fly_now, mission_t_s
 
@@ -91,12 +92,22 @@ CROSSING = (
 ENDS_AT_S, PASSED_S = 0.7, 4.2
 
 
-def without_an_agent(seed: int = 0) -> float:
-    """Return how close vehicles come when an agent ends, of which the others are told; its own flies on for 2 s."""
+def without_an_agent(seed: int = 0, *, at_s: float = ENDS_AT_S, is_frozen: bool = False) -> float:
+    """Return how close vehicles come when an agent ends, of which the others are told; its own flies on for 2 s.
+
+    Of one that is frozen nobody is told anything.
+    """
+
+    def end(running: Lockstep) -> None:
+        if is_frozen:
+            running.frozen.add(1)
+        else:
+            running.kill(1)
+
     flight = fly_now(
         *CROSSING,
         config=CONFIG,
-        at={ENDS_AT_S: lambda running: running.kill(1)},
+        at={at_s: end},
         until=lambda running: mission_t_s(running) > PASSED_S,
         seed=seed,
     )
@@ -117,3 +128,14 @@ def test_negative_control_one_that_is_expected_to_brake_as_soon_as_a_px4_is_hit(
 
     monkeypatch.setattr(world_model, "without_setpoints", as_a_px4)
     assert without_an_agent() < 0.48, "bodies touch"
+
+
+@pytest.mark.parametrize("at_s", [0.5, 0.7, 0.9, 1.1])
+@pytest.mark.usefixtures("configured_starts")
+def test_others_keep_clear_of_one_whose_agent_is_silent_while_they_hear_each_other(
+    monkeypatch: pytest.MonkeyPatch, at_s: float
+) -> None:
+    """Its host is lost, say. By what all have committed to, which it does not fly any more, bodies touch."""
+    assert without_an_agent(at_s=at_s, is_frozen=True) >= 0.85
+    monkeypatch.setattr(NonParticipants, "silent", lambda *_: KeepOuts())
+    assert without_an_agent(at_s=at_s, is_frozen=True) < 0.48, "negative control: bodies touch"

@@ -9,13 +9,14 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from swarmctl.agent.planning.commitment_publisher import CommitmentPublisher
+from swarmctl.agent.planning.non_participants import NonParticipants
 from swarmctl.agent.sensing.deviations import Deviations
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.peer_trajectories import PeerTrajectories
 from swarmctl.control.collision.encounters import Encounters
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, keep_out_of_commitment
+from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments
@@ -95,6 +96,7 @@ class Coordination:
         self._hears = self._peers  # every message of these
         self._others_m_s = 0.0  # speed at which somebody else flies the vehicle
         self._params = params
+        self._non_participants = NonParticipants(world_model, separation, dt_us=planner.dt_us, steps=planner.steps)
         self._is_committed = False
         self._tube_m = separation.budget.tube_m
         self._tube = Tube(self._tube_m)
@@ -196,6 +198,7 @@ class Coordination:
             disturbance_ned_m_s2=disturbance_ned_m_s2,
         )
         commitments.evade(now)
+        commitments.evade(now, self._silent(utc_us, relied_on))
         unsure = {a for a in required & near if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
         self.alert = self._why_slow(unsure)
         if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
@@ -240,9 +243,9 @@ class Coordination:
     def _relied_on(self, utc_us: int, known: Mapping[int, TrajectoryMessage], required: Set[int]) -> Set[int]:
         """Return the peers whose commitments are relied on, and remember where lost ones end.
 
-        Silence alone is no reason to doubt a commitment: to shrink from a peer that is merely cut off is to leave the
-        own commitment, before peers that rely on that. Only what is newly planned keeps clear of what a silent peer's
-        autopilot may do instead (see `step`).
+        Silence alone is no reason to doubt a commitment: a peer that is merely cut off relies on the own one. What its
+        autopilot may do instead is kept clear of by what is newly planned, and by evasions that are clear of all
+        commitments, too (see `step`).
         """
         conflicting = self._commitments.conflicting_peers(utc_us, known)
         if conflicting != self._conflicting:
@@ -252,7 +255,8 @@ class Coordination:
         deviating |= {agent for agent, message in known.items() if message.tube_m > self._tube_m + _SAME_M}
         committed = {agent for agent, message in known.items() if message.is_committed}
         lost_peers = [agent for agent in known.keys() - required if agent in committed]
-        self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
+        ends = self._non_participants.ends
+        self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in ends(known[agent])]
         relied_on = (required | self._membership.excluded - self._ended) & committed - conflicting - deviating
         self.committed_peers = {a: known[a].followed for a in relied_on if self._world_model.paths.is_near(a)}
         return relied_on
@@ -375,27 +379,20 @@ class Coordination:
         silent = [a for a in required if min(self._silence_us(a, utc_us), utc_us - begun_us) > _CUT_OFF_US]
         return f"cut off from {_names(silent)}" if silent else ""
 
-    def _ends(self, message: TrajectoryMessage) -> list[KeepOut]:
-        separation, budget = self._separation, self._separation.budget
-        ends = [np.tile(trajectory.pos_ned_m[-1], (2, 1)) for trajectory in message.followed]
-        return [keep_out_of_commitment(end, message.agent, separation, budget) for end in ends]
-
     def _others(
         self, t0_utc_us: int, state: VehicleState, phase: Phase, without: Set[int], encounters: Encounters
     ) -> KeepOuts:
-        """Return keep-outs of obstacles and of peers but those in `without`, on the planner's grid from `t0_utc_us` on.
-
-        What a stale peer does is unknown, so its hard minimum distance includes all of the margin that grows with age.
-        Those that are too close already say since which distance, so that plan by plan none comes closer.
-        """
+        """Return keep-outs of obstacles and of peers but those in `without`, for a plan that begins at `t0_utc_us`."""
         assert self._commitments.flown is not None
-        steps, dt_us = self._commitments.steps, self._commitments.dt_us
-        found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase=phase, without=without)
-        spent_m = self._separation.budget.planned_beyond_hard_min_m
-        aged = (replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found)
-        return encounters.noted(
-            KeepOuts(aged, found.pos_ned_m) if found else found, np.array(self._commitments.flown.at(t0_utc_us)[0])
+        begin_ned_m = np.array(self._commitments.flown.at(t0_utc_us)[0])
+        return self._non_participants.keep_outs(
+            t0_utc_us, state.pos_ned_m, begin_ned_m, phase, without=without, encounters=encounters
         )
+
+    def _silent(self, utc_us: int, relied_on: Set[int]) -> KeepOuts:
+        """Return where vehicles of silent peers may be from now on."""
+        silence_us = {agent: self._silence_us(agent, utc_us) for agent in self._far_peers.near - self._ended}
+        return self._non_participants.silent(utc_us, silence_us, relied_on)
 
 
 def _names(agents: Iterable[int]) -> str:

@@ -246,6 +246,20 @@ class WorldModel:
         seen = self.obstacles.visible(pos_ned_m, act_utc_us)
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in seen.values()]
 
+    def ways_without_setpoints(self, agents: Set[int], t0_utc_us: int, dt_us: int, steps: int) -> dict[int, Array]:
+        """Return positions (steps+1, 3) of vehicles that fly, as if their agents had sent no setpoint since their path.
+
+        Args:
+            agents: whose vehicles; of those on the ground, and of those out of reach, there are none.
+            t0_utc_us, dt_us, steps: the time grid.
+        """
+        paths = [p for p in self.paths.near() if p.agent in agents and self.statuses.flies_itself(p.agent)]
+        if not paths:
+            return {}
+        ways, brake_m_s2 = [self._without_setpoints(path) for path in paths], self._params.brake_m_s2
+        places = aligned(ways, t0_utc_us, dt_us, steps, brake_m_s2=brake_m_s2)
+        return {path.agent: points for path, points in zip(paths, places, strict=True)}
+
     def _ways(self, path: PredictedPath, utc_us: int) -> tuple[PredictedPath, ...]:
         """Return the paths by which a peer is predicted: its newest, the one without setpoints, or both.
 

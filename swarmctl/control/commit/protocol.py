@@ -51,8 +51,10 @@ The proof rests on these assumptions, each of which is watched in flight:
   part.
 - Commitments are kept. A commitment changes without acknowledgement only where a vehicle first commits at speed, where
   it is blown far from its tube, and by `evade`, before something that does not take part: around it, to a stop, or
-  above it. An agent that finds a peer's commitment in conflict with its own (`conflicting_peers`), or a peer outside
-  its tube, keeps clear of that peer as of one that does not take part.
+  above it. So it does, but only to what conflicts with nothing known, before where the vehicle of a peer may be that is
+  silent while most are heard. Two that evade at once may conflict. An agent that finds a peer's commitment in conflict
+  with its own (`conflicting_peers`), or a peer outside its tube, keeps clear of that peer as of one that does not take
+  part.
 - Every agent takes part. A vehicle that does not (a pilot flies it, its agent has died) is a keep-out of the
   best-effort kind. A silent peer stays a participant; when one is left out is in `swarmctl.control.commit.membership`:
   it takes evidence or a majority. The events `membership` and `operator` say who was, and on whose word.
@@ -63,11 +65,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
+from swarmctl.control.collision.separation import KeepOuts
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.situation import Situation
 from swarmctl.core.trajectory import Trajectory, by_exact_clock, delayed, resting
@@ -227,24 +230,33 @@ class Commitments:
         unsure = {agent: t for agent, t in commitments.items() if any(t is other for other in new)}
         return {a for a, t in unsure.items() if self._planner.conflicts(self.committed, utc_us, [by_exact_clock(t)])}
 
-    def evade(self, now: Situation) -> None:
+    def evade(self, now: Situation, doubted: KeepOuts | None = None) -> None:
         """Replace the committed trajectory without acknowledgement, where waiting for one would be too late.
 
         It is replaced only when it hits a keep-out and so does braking `_EVASION_DELAY_S` after the lead.
 
         Args:
             now: a plan that begins at once, and keep-outs from now on.
+            doubted: further keep-outs, of peers that may as well fly as they have committed to: nothing is evaded to
+                that conflicts with anything known. None: none, and what does not take part is more important.
         """
         flown = self.flown
+        if doubted is not None:
+            if not doubted:
+                return
+            now = replace(now, others=KeepOuts([*now.others, *doubted]))
         if flown is None or not now.others or self._planner.is_clear(flown, now):
             return
         later_us = now.utc_us + self.lead_us + round(_EVASION_DELAY_S * 1e6)
         if self._planner.is_clear(self._planner.stopping_candidate(flown, later_us, now.utc_us), now):
             return
         evasive_trajectory = self._planner.evasive_trajectory(flown, now)
-        if evasive_trajectory is not None:
-            self._replace(evasive_trajectory)
-            self.counts.evasive += 1
+        if evasive_trajectory is None:
+            return
+        if doubted and self._planner.conflicts(evasive_trajectory, now.utc_us, now.followed):
+            return
+        self._replace(evasive_trajectory)
+        self.counts.evasive += 1
 
     def is_due(self, utc_us: int) -> bool:
         """Tell whether there is no proposal and `period_s` has passed since the last attempt."""

@@ -683,3 +683,19 @@ def test_the_margin_of_who_is_done_grows_with_age_while_its_vehicle_moves(
     before_m = apart_m()
     bench.clock.advance(500_000)
     assert (apart_m() > before_m + 0.1) is grows
+
+
+@pytest.mark.parametrize(
+    ("mode", "agents", "expected"),
+    [(Mode.TRACKING, {1}, [1]), (Mode.TRACKING, {2}, []), (Mode.PILOT_OVERRIDE, {1}, [])],
+    ids=["", "another one", "flown by a pilot"],
+)
+def test_only_vehicles_that_agents_fly_miss_their_setpoints(mode: Mode, agents: set[int], expected: list[int]) -> None:
+    bench = Bench()
+    bench.say_path()
+    bench.say_status(mode=mode, phase=Phase.TRACK)
+    bench.tick()
+    ways = bench.world_model.ways_without_setpoints(agents, bench.clock.utc_us(), 100_000, 5)
+    assert list(ways) == expected
+    for points in ways.values():
+        np.testing.assert_allclose(points, np.tile(HERE, (6, 1)), atol=1e-6)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOut, SeparationParams
+from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
 from swarmctl.control.commit import trajectory_planner
 from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.commit.situation import DesiredReference
@@ -65,6 +65,22 @@ def test_an_evasion_is_found_by_the_peer_it_conflicts_with() -> None:
     assert first.counts.evasive == 1, "before a wall there is no time for acknowledgements"
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}, "as long as it does"
+
+
+@pytest.mark.parametrize("followed", [True, False], ids=["", "control: nobody follows"])
+def test_before_what_is_merely_doubted_nothing_is_evaded_to_that_conflicts_with_what_is_known(followed: bool) -> None:
+    """Who is silent may fly as it has committed to; who is behind certainly does."""
+    first, second = meeting()
+    now = builders.situation(
+        utc_us=UTC_US,
+        begin_us=UTC_US,
+        desired=DesiredReference(at_goal),
+        peers=message_of(second, 1) if followed else {},
+    )
+    first.evade(now, KeepOuts())
+    assert first.counts.evasive == 0, "nobody is doubted"
+    first.evade(now, KeepOuts([wall(1.6, first)]))
+    assert first.counts.evasive == (0 if followed else 1)
 
 
 DT_US = 70_000  # of nobody else's trajectories
