@@ -112,10 +112,12 @@ def evasions(flight: TrialFlight) -> int:
     return sum(policy.coordination.counts.evasive for policy in policies if isinstance(policy, Guaranteed))
 
 
-def test_nobody_leaves_a_commitment_before_peers_that_are_merely_cut_off() -> None:
+def test_nobody_leaves_a_commitment_for_a_conflict_before_peers_that_are_merely_cut_off() -> None:
+    """They fly as they have committed to, but might be frozen: one evades where their autopilots would have flown."""
     flight = two_of_six_cut_off()
     assert flight.monitor.min_separation_m >= COMMITTED_M
-    assert evasions(flight) == 0
+    assert evasions(flight) <= 1
+    assert events(flight, "conflicting_commitment") == []
     excluded = [e for e in events(flight, "membership") if e["excluded"]]
     assert {str(e["source"]) for e in excluded} == {agent_name(i) for i in range(4)}
     assert all(e["excluded"] == [4, 5] for e in excluded)
