@@ -23,6 +23,7 @@ from swarmctl.core.types import Array
 BRAKE_M_S2 = 2.2  # on average, until it rests
 HOLD_BRAKE_M_S2 = 1.5
 ANSWER_S = 0.25  # in which an acceleration becomes another one, but for 1/e of it
+_LEVEL, _VERTICAL = slice(0, 2), slice(2, 3)
 _NO_DRAG_1_S = 1e-3  # less is none
 _AT_REST_M_S = 1e-6  # a slower velocity has no direction
 _SEEN_AFTER_S = 0.05  # that a setpoint is missing: PX4 looks for it every 0.1 s
@@ -50,18 +51,37 @@ def without_setpoints_ned_m(
         drag_1_s: linear drag over mass, in still air; not while it brakes, which has been measured with it.
     """
     coasts_s, keeps_s = coasts_s + _SEEN_AFTER_S, min(keeps_s, coasts_s) + _SEEN_AFTER_S
+    brake_m_s2 = min(brake_m_s2, BRAKE_M_S2)
+    found = np.empty((len(ahead_s), 3))
+    for axes, until_s in ((_LEVEL, coasts_s), (_VERTICAL, keeps_s)):
+        limits = {"keeps_s": keeps_s, "coasts_s": until_s, "brake_m_s2": brake_m_s2, "drag_1_s": drag_1_s}
+        found[:, axes] = pos_ned_m[axes] + _way(vel_ned_m_s[axes], accel_ned_m_s2[axes], ahead_s, **limits)
+    return found
+
+
+def _way(
+    vel_m_s: Array,
+    accel_m_s2: Array,
+    ahead_s: Array,
+    *,
+    keeps_s: float,
+    coasts_s: float,
+    brake_m_s2: float,
+    drag_1_s: float,
+) -> Array:
+    """Return displacements (N, M) [m] along M axes, of a motion (M,); see `without_setpoints_ned_m`."""
     kept_s, later_s = np.minimum(ahead_s, keeps_s)[:, None], np.maximum(ahead_s - keeps_s, 0.0)
-    pos = pos_ned_m + kept_s * vel_ned_m_s + _way_s2(kept_s, drag_1_s) * accel_ned_m_s2
-    vel = vel_ned_m_s + _slowed_s(keeps_s, drag_1_s) * accel_ned_m_s2
-    accel = math.exp(-drag_1_s * keeps_s) * accel_ned_m_s2
+    way = kept_s * vel_m_s + _way_s2(kept_s, drag_1_s) * accel_m_s2
+    vel = vel_m_s + _slowed_s(keeps_s, drag_1_s) * accel_m_s2
+    accel = math.exp(-drag_1_s * keeps_s) * accel_m_s2
     level_s = coasts_s - keeps_s
     if level_s > 0.0:
         settled, level = vel + ANSWER_S * accel, np.minimum(later_s, level_s)[:, None]
-        pos += _slowed_s(level, drag_1_s) * settled + ANSWER_S**2 * np.expm1(-level / ANSWER_S) * accel
+        way += _slowed_s(level, drag_1_s) * settled + ANSWER_S**2 * np.expm1(-level / ANSWER_S) * accel
         left, settled = math.exp(-level_s / ANSWER_S) * accel, math.exp(-drag_1_s * level_s) * settled
         vel, accel = settled - ANSWER_S * left, left - drag_1_s * settled
         later_s = np.maximum(later_s - level_s, 0.0)
-    return np.asarray(pos + settling_displacement(vel, accel, later_s, brake_m_s2=min(brake_m_s2, BRAKE_M_S2)))
+    return np.asarray(way + settling_displacement(vel, accel, later_s, brake_m_s2=brake_m_s2))
 
 
 def _slowed_s(t_s: Any, drag_1_s: float) -> Any:
@@ -77,19 +97,19 @@ def _way_s2(t_s: Array, drag_1_s: float) -> Array:
 
 
 def settling_displacement(vel_ned_m_s: Array, accel_ned_m_s2: Array, t_s: Array, *, brake_m_s2: float) -> Array:
-    """Return displacements (N, 3) NED [m] at `t_s` (N,) after the autopilot has taken over, until the vehicle rests.
+    """Return displacements (N, M) [m] at `t_s` (N,) after the autopilot has taken over, until the vehicle rests.
 
     Its acceleration approaches exponentially, as its attitude does, a deceleration against the velocity that it will
     have by then; 0: it flies on level.
 
     Args:
-        vel_ned_m_s, accel_ned_m_s2: (3,) its motion when the autopilot takes over.
+        vel_ned_m_s, accel_ned_m_s2: its motion along M axes when the autopilot takes over, (M,).
         t_s: (N,) times, >= 0.
         brake_m_s2: the deceleration.
     """
     settled = vel_ned_m_s + ANSWER_S * accel_ned_m_s2  # but for the braking meanwhile
     speed = math.sqrt(float(settled @ settled))
-    goal = settled * (-brake_m_s2 / speed) if speed >= _AT_REST_M_S else np.zeros(3)
+    goal = settled * (-brake_m_s2 / speed) if speed >= _AT_REST_M_S else np.zeros_like(settled)
     if brake_m_s2 > 0.0:
         t_s = np.minimum(t_s, ANSWER_S + speed / brake_m_s2)
     t = t_s[:, None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,6 +91,7 @@ CROSSING = (
     *("mission.kind=swap", "mission.swap.travel_s=6", "mission.duration_s=60"),
 )
 ENDS_AT_S, PASSED_S = 0.7, 4.2
+LITTLE_M_S2 = 7.5  # thrust over mass
 
 
 def without_an_agent(seed: int = 0, *, at_s: float = ENDS_AT_S, is_frozen: bool = False) -> float:
@@ -139,3 +141,38 @@ def test_others_keep_clear_of_one_whose_agent_is_silent_while_they_hear_each_oth
     assert without_an_agent(at_s=at_s, is_frozen=True) >= 0.85
     monkeypatch.setattr(NonParticipants, "silent", lambda *_: KeepOuts())
     assert without_an_agent(at_s=at_s, is_frozen=True) < 0.48, "negative control: bodies touch"
+
+
+def falls_off_m(*, is_told: bool) -> float:
+    """Return how far a vehicle is from where another expects it, 1.5 s after a last setpoint with little thrust."""
+
+    def sink(running: Lockstep) -> None:
+        agent = running.agents[1]
+        assert agent is not None
+        safety_filter = agent._setpoints._safety_filter
+        safety_filter.keep_apart = lambda *_, **__: np.array([0.0, 0.0, LITTLE_M_S2])  # type: ignore[method-assign]
+
+    begun, found = list[int](), list[float]()
+
+    def is_late(running: Lockstep) -> bool:
+        now_us, utc_us, watcher = running.clock.now_us(), running.clock.utc_us(), running.agents[0]
+        if 1 not in running.frozen or watcher is None:
+            return False
+        begun.append(now_us)
+        if now_us < begun[0] + 1_500_000:
+            return False
+        model = watcher._world_model
+        (path,) = (path for path in model.paths.latest() if path.agent == 1)
+        model.paths._newest[1] = path if is_told else replace(path, setpoint_accel_ned_m_s2=None)
+        model.paths._near = None
+        expected = model.ways_without_setpoints({1}, utc_us, 100_000, 1)[1][0]
+        found.append(float(np.linalg.norm(running.world.truth_rows()["pos_ned_m"][1] - expected)))
+        return True
+
+    fly_now(*CROSSING, config=CONFIG, at={0.9: sink, 0.94: lambda running: running.frozen.add(1)}, until=is_late)
+    return found[-1]
+
+
+def test_it_is_known_how_far_a_vehicle_sinks_whose_last_setpoint_has_little_thrust() -> None:
+    assert falls_off_m(is_told=True) < 0.3
+    assert falls_off_m(is_told=False) > 1.0, "negative control: by its path it flies on level"

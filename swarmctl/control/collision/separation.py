@@ -209,8 +209,9 @@ def without_setpoints(
 ) -> PredictedPath:
     """Return the path of a vehicle that has received no setpoint since it began to fly a path.
 
-    Its autopilot keeps the last attitude for a while, so the level acceleration goes on that the vehicle has when it
-    has taken that attitude, instead of what was planned to follow. It may then fly on level. Where the returned path
+    Its autopilot keeps the last attitude and thrust for a while, so the acceleration goes on that the vehicle has when
+    it has taken that attitude, instead of what was planned to follow: the one that its last setpoint asks for, if that
+    is told, or the level one of the path. It may then fly on level. Where the returned path
     ends the autopilot brakes, as beyond the end of any path.
 
     Args:
@@ -230,7 +231,6 @@ def without_setpoints(
     vel = (second - first) / dt_s - 0.5 * dt_s * accel  # at the first point
     if path.setpoint_accel_ned_m_s2 is not None:
         accel = path.setpoint_accel_ned_m_s2 - drag_1_s * vel
-        accel[2] = 0.0
     ahead_s = grid(max(1, round(_STOPS_US / path.dt_us) - lag)) * dt_s
     limits = {"keeps_s": keeps_s - lag * dt_s, "coasts_s": coasts_s - lag * dt_s, "drag_1_s": drag_1_s}
     pos = without_setpoints_ned_m(first, vel, accel, ahead_s, **limits)

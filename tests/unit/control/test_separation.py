@@ -115,8 +115,17 @@ def test_without_setpoints_what_the_last_setpoint_asks_for_is_kept_where_that_is
     np.testing.assert_array_equal(flown[:5], brakes[:5])
     acceleration = np.diff(flown[4:10], n=2, axis=0) / 0.05**2
     vel = np.diff(flown[4:10], axis=0)[:-1] / 0.05
-    np.testing.assert_allclose(acceleration[:, :2], [0.0, 3.0] - drag_1_s * vel[:, :2], atol=0.15)
-    np.testing.assert_allclose(flown[:, 2], -2.0, atol=1e-12)
+    np.testing.assert_allclose(acceleration, [0.0, 3.0, 1.0] - drag_1_s * vel, atol=0.15)
+
+
+def test_without_setpoints_height_is_held_once_the_attitude_is_not_kept_any_more() -> None:
+    """An ArduCopter flies on level then; with little thrust it does not sink on meanwhile."""
+    rests = replace(peer(np.tile([0.0, 0.0, -9.0], (41, 1))), setpoint_accel_ned_m_s2=np.array([1.0, 0.0, 2.0]))
+    flown = align(without_setpoints(rests, keeps_s=1.0, coasts_s=2.0), UTC_US, 100_000, 30, brake_m_s2=3.0)
+    down_m_s, north_m_s = np.diff(flown[:, 2]) / 0.1, np.diff(flown[:, 0]) / 0.1
+    assert down_m_s[10] == pytest.approx(2.1, abs=0.1)
+    assert down_m_s[19] < 1.3 and down_m_s[26] < 0.1
+    assert north_m_s[19] == pytest.approx(1.3, abs=0.1), "it flies on for 2 s"
 
 
 def test_without_setpoints_an_autopilot_that_takes_over_late_keeps_the_attitude_and_flies_on_level() -> None:
