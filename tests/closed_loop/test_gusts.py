@@ -129,8 +129,8 @@ def blown_farther_than_expected(*sets: str, too_close_m: float = 0.0) -> Collisi
     """Six vehicles swap with room for gusts of 3.65 m/s; each is hit by a wind of 8 m/s of its own in the first 4 s.
 
     That is more than is guaranteed: what is shown is that the reaction makes the difference in one flight, not in all.
-    Of six flights drawn one touches with it; means are 1.14 m, and 0.94 m at most without it. A flight ends when two
-    are too close.
+    Of six flights drawn one touches with it; this one keeps 1.49 m, and 0.85 m without it. A flight ends when two are
+    too close.
     """
     settings = " ".join(("separation.gust_m_s=3.65", *sets))
     cell = replace(GUARANTEED_SWAP, agents=6, airframe="x500", disturbance="steps:8", sets=settings)
@@ -140,7 +140,7 @@ def blown_farther_than_expected(*sets: str, too_close_m: float = 0.0) -> Collisi
 
 @pytest.mark.usefixtures("configured_starts")
 def test_vehicles_that_are_blown_out_of_their_tubes_commit_anew_and_keep_apart() -> None:
-    assert blown_farther_than_expected().min_separation_m >= 0.85
+    assert blown_farther_than_expected().min_separation_m >= 1.2
 
 
 @pytest.mark.usefixtures("configured_starts")
@@ -152,4 +152,4 @@ def test_negative_control_vehicles_that_chase_what_they_were_committed_to_come_t
     monkeypatch.setattr(PeerClocks, "spread_us", lambda self, agent: 0)
     monkeypatch.setattr(Tube, "update", lambda self, *_: False)
     monkeypatch.setattr(Commitments, "wait_for", lambda self, *_: None)
-    assert blown_farther_than_expected("separation.approach_01=0", too_close_m=0.75).min_separation_m < 0.75
+    assert blown_farther_than_expected("separation.approach_01=0", too_close_m=0.9).min_separation_m < 0.9

@@ -55,9 +55,9 @@ def test_agents_missing_nine_of_ten_deadlines_come_to_rest_far_apart_and_land(se
 
 
 @pytest.mark.usefixtures("configured_starts")
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, 3])
 def test_negative_control_without_the_reaction_they_come_too_close(seed: int) -> None:
-    """Six starts, five of them shifted, keep 0.73 to 1.23 m: they meet as if nothing were wrong."""
+    """Six starts, five of them shifted, keep 0.89 to 1.23 m: they meet as if nothing were wrong."""
     flight = swapped(*UNPROTECTED, until=closer_than(1.0), at={0.5: one_tick_of(10)}, seed=seed)
     assert flight.separation_m() < 1.0
 
