@@ -44,6 +44,7 @@ class PathSharing:
 
     The acceleration a is that by which peers widen distances with the age of a path (`age_accel_m_s2`). Paths are
     compared as peers read them, with what compact points are rounded by. What is published has `error_m` more margin.
+    What the last setpoint asks for is not compared: peers know it as of the newest path that they have.
 
     Args:
         params: see there.
