@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 from itertools import takewhile
 
 from swarmctl.bus.bus import agent_name
@@ -102,6 +102,16 @@ class PeerTrajectories:
         *_, first_us = later_us
         said_us = message.sent_utc_us - self._clocks.ahead_us(message.agent)
         return said_us - (first_us - self._clocks.ahead_us(agent))
+
+    def silence_us(self, agent: int, utc_us: int) -> int:
+        """Return the time since the newest message of a peer; 0 for one that has never been heard."""
+        return utc_us - self.received_utc_us.get(agent, utc_us)
+
+    def silent(self, agents: Set[int], utc_us: int, longer_than_us: int) -> set[int]:
+        """Return those of some peers that have been silent for longer than that."""
+        if utc_us - min(self.received_utc_us.values(), default=utc_us) <= longer_than_us:
+            return set()  # as nearly always
+        return {agent for agent in agents if self.silence_us(agent, utc_us) > longer_than_us}
 
     def heard(self, peers: Iterable[int]) -> dict[int, tuple[int, int]]:
         """Return stamp and arrival of the newest message of some peers that were heard."""

@@ -69,6 +69,9 @@ class LinePlanner:
     def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         return None
 
+    def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
+        return None
+
 
 class LineAgent:
     """One of the two."""

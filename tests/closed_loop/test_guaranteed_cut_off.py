@@ -197,7 +197,11 @@ def test_nobody_is_excluded_for_silence_before_anybody_flies() -> None:
 
 def test_negative_control_who_is_excluded_on_the_ground_is_waited_for_in_vain(monkeypatch: pytest.MonkeyPatch) -> None:
     def by_silence(self: Coordination, utc_us: int) -> set[int]:
-        return {i for i in self._peers - self._ended if self._silence_us(i, utc_us) > coordination._SUSPECT_US}
+        return {
+            i
+            for i in self._peers - self._ended
+            if self._peer_trajectories.silence_us(i, utc_us) > coordination._SUSPECT_US
+        }
 
     monkeypatch.setattr(Coordination, "_suspected", by_silence)
     begun, excluded = cut_off_on_the_ground()

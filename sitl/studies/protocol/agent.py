@@ -11,6 +11,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from sitl.studies.protocol.symbols import (
     ANYWHERE,
     NOWHERE,
@@ -20,6 +22,7 @@ from sitl.studies.protocol.symbols import (
     places_of,
     trajectory_of,
 )
+from swarmctl.control.collision.separation import KeepOuts, SeparationParams, keep_out_of_commitment
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import Commitments, acknowledgements
@@ -32,6 +35,9 @@ NOTHING: frozenset[str] = frozenset()
 DIES, RESTARTS, TAKEN_OVER = "dies", "restarts", "is taken over"
 INTERRUPTIONS = frozenset({DIES, RESTARTS, TAKEN_OVER})
 _PARAMS = CommitParams()
+_SOMEBODY = KeepOuts(
+    [keep_out_of_commitment(np.zeros((2, 3)), AGENTS, SeparationParams(), SeparationParams().budget)]
+)  # the planner of symbols does not look where
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,7 @@ class Scope:
     interruptions: int = 0  # how many of the following there may be, of all agents together
     interrupted: frozenset[int] = frozenset(range(AGENTS))  # agents that they may befall
     kinds: frozenset[str] = INTERRUPTIONS
+    doubts: frozenset[int] = NOBODY  # agents that may doubt others at any time, and stop before them
 
 
 class Said(NamedTuple):
@@ -166,16 +173,12 @@ class Agent:
             assert commitments.committed is not None
             is_new = reading and places_of(commitments.committed) != wanted
             if is_new and commitments.is_due(reading):
-                commitments.propose(
-                    Situation(
-                        utc_us=reading,
-                        begin_us=reading,
-                        desired=ANYWHERE,
-                        peers=messages,
-                        others=(),
-                        disturbance_ned_m_s2=NOWHERE,
-                    )
-                )
+                commitments.propose(_situation(reading, messages))
+            yield self._read(before, commitments)
+        if self._number in self._scope.doubts and known.keys() == self._peers:  # who is silent has been heard
+            commitments = self._commitments(before, "", doubts=True)
+            commitments.update(before.clock, messages, required)
+            commitments.stop_before(_situation(before.clock, messages), _SOMEBODY)
             yield self._read(before, commitments)
 
     def _wishes(self, before: Process) -> Iterator[tuple[str, int]]:
@@ -185,8 +188,9 @@ class Agent:
             if reading > before.clock:
                 yield from ((wanted, reading) for wanted in self._choices)
 
-    def _commitments(self, state: Process, wanted: str) -> Commitments:
-        commitments = self._rules.commitments(self._number, _PARAMS, self._rules.planner(self._choices[0], wanted))
+    def _commitments(self, state: Process, wanted: str, *, doubts: bool = False) -> Commitments:
+        planner = self._rules.planner(self._choices[0], wanted, doubts)
+        commitments = self._rules.commitments(self._number, _PARAMS, planner)
         commitments.committed = trajectory_of(state.committed)
         commitments.proposal = _proposal(self._number, state.proposal)
         commitments._number = state.clock
@@ -225,6 +229,12 @@ class Agent:
         elif after.promised != before.promised:
             done.append(f"promises to exclude {sorted(after.promised)}")
         return " and ".join(done) or "listens"
+
+
+def _situation(utc_us: int, peers: Mapping[int, TrajectoryMessage]) -> Situation:
+    return Situation(
+        utc_us=utc_us, begin_us=utc_us, desired=ANYWHERE, peers=peers, others=(), disturbance_ned_m_s2=NOWHERE
+    )
 
 
 def _proposal(agent: int, made: tuple[int, int, str] | None) -> Proposal | None:

@@ -75,6 +75,21 @@ class ProposesBlindly(SymbolicPlanner):
         return super().proposal(committed, replace(now, peers={}))
 
 
+class StopsAnywhere(SymbolicPlanner):
+    """Stops where others pass at other times."""
+
+    def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
+        return super().halting(committed, replace(now, peers={}))
+
+
+class StopsBesideProposals(SymbolicPlanner):
+    """Stops where others, of which it may have acknowledged that, are about to commit to pass."""
+
+    def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
+        peers = {i: replace(m, proposal=None) for i, m in now.peers.items()}
+        return super().halting(committed, replace(now, peers=peers))
+
+
 class VotesWithoutMajority(Membership):
     """Excludes, although those that agree are no majority."""
 
@@ -122,6 +137,7 @@ _PAIR = Scope(world="pair", readings=_ONCE)
 _EXCLUDING = replace(_PAIR, suspects=frozenset({0}))
 _SPLIT = replace(_PAIR, suspects=frozenset({0, 1}))
 _RESTARTING = replace(_PAIR, interruptions=1, kinds=frozenset({RESTARTS}))
+_STOPPING = Scope(world="turns", readings=_ONCE, doubts=frozenset({0, 1}))
 REMOVED = (
     Removed(
         rule="only the newest message counts",
@@ -177,6 +193,21 @@ REMOVED = (
         rule="what the excluded have said still counts",
         rules=Rules(remember_silent=False),
         scope=_EXCLUDING,
+    ),
+    Removed(
+        rule="stop unasked only where nobody else passes, whenever that is",
+        rules=Rules(planner=StopsAnywhere),
+        scope=_STOPPING,
+    ),
+    Removed(
+        rule="nor is about to commit to pass",
+        rules=Rules(planner=StopsBesideProposals),
+        scope=_STOPPING,
+    ),
+    Removed(
+        rule="nor where others may exclude who has stopped",
+        rules=Rules(),
+        scope=replace(_STOPPING, suspects=frozenset({0})),
     ),
     Removed(
         rule="only a majority excludes",

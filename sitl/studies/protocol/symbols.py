@@ -1,7 +1,8 @@
 """Symbols in place of trajectories: what a trajectory passes is a string of places, one letter each.
 
-Two trajectories conflict when they pass the same place. The planner offers any trajectory it is told to, so the
-protocol is explored whatever a real planner would choose.
+Two trajectories conflict when they pass the same place at the same time: a small letter is passed early, a capital one
+late. One that has stopped on its way may be at each of its places at any time from then on. The planner offers any
+trajectory it is told to, so the protocol is explored whatever a real planner would choose.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ WORLDS = {
     "pair": (("a", "x"), ("b", "x"), ("c",)),  # two meet, one only votes
     "crossing": (("a", "x"), ("b", "x"), ("c", "x")),  # one place that everybody wants
     "crossings": (("a", "x"), ("b", "xy"), ("c", "y")),  # two of the three do not meet
+    "turns": (("a", "x"), ("b", "X"), ("c",)),  # two pass the same place one after the other, one only votes
     "follow": (("a", "b"), ("b", "x"), ("c", "x")),  # one wants where another stands, which wants to leave
 }  # by agent, the trajectories it chooses from; it begins with the first
 
@@ -42,8 +44,13 @@ def places_of(trajectory: Trajectory) -> str:
 
 
 def in_conflict(one: str, other: str) -> bool:
-    """Tell whether two trajectories pass the same place."""
+    """Tell whether two trajectories pass the same place at the same time."""
     return not set(one).isdisjoint(other)
+
+
+def at_any_time(places: str) -> str:
+    """Return what is passed by a trajectory that has stopped somewhere among its places."""
+    return "".join(sorted({*places.lower(), *places.upper()}))
 
 
 class SymbolicPlanner:
@@ -52,10 +59,11 @@ class SymbolicPlanner:
     Args:
         here: places that the vehicle passes when it stops at once.
         wanted: places to propose.
+        doubts: whether a vehicle is met that may not fly as its agent has committed to.
     """
 
-    def __init__(self, here: str, wanted: str) -> None:
-        self._here, self._wanted = here, wanted
+    def __init__(self, here: str, wanted: str, doubts: bool = False) -> None:
+        self._here, self._wanted, self._doubts = here, wanted, doubts
         self.dt_us, self.steps = _DT_US, 1
 
     def proposal(self, committed: Trajectory, now: Situation) -> Trajectory | None:
@@ -68,8 +76,8 @@ class SymbolicPlanner:
         return any(in_conflict(places_of(trajectory), places_of(other)) for other in known)
 
     def is_clear(self, trajectory: Trajectory, now: Situation) -> bool:
-        """There are no keep-outs."""
-        return True
+        """There are no keep-outs but those of doubted vehicles."""
+        return not self._doubts
 
     def stopping_from(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> Trajectory:
         """Return the trajectory by which the vehicle stops where it is."""
@@ -82,3 +90,8 @@ class SymbolicPlanner:
     def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """Find none."""
         return None
+
+    def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
+        """See `Planner`."""
+        halted = trajectory_of(at_any_time(places_of(committed)))
+        return None if halted is committed or self.conflicts(halted, now.utc_us, now.followed) else halted

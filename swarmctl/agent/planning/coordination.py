@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from swarmctl.agent.planning.commitment_publisher import CommitmentPublisher
-from swarmctl.agent.planning.non_participants import NonParticipants
+from swarmctl.agent.planning.non_participants import NonParticipants, most_are_heard
 from swarmctl.agent.sensing.deviations import Deviations
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
@@ -29,6 +29,7 @@ from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import MAX_MARGIN_M, Array, Phase, VehicleState
 
 _SUSPECT_US = 5_000_000  # without a message, after which a peer is suspected: bursts of loss end sooner
+_SILENT_US = 160_000  # four messages have not come, at the least
 _GAP_US = 1_000_000  # without a fresh state, after which nothing is committed any more
 _FASTER_01 = 1.1  # of the speed at which somebody else flies the vehicle, which may grow until the next message
 _SAME_M = 1e-3  # tubes that differ by less are equal: messages round
@@ -160,9 +161,7 @@ class Coordination:
         messages = self._peer_trajectories.newest.values()
         if self._begun_us is None and not any(message.is_committed for message in messages):
             return set()
-        if utc_us - min(self._peer_trajectories.received_utc_us.values(), default=utc_us) <= _SUSPECT_US:
-            return set()  # as nearly always
-        return {agent for agent in self._peers - self._ended if self._silence_us(agent, utc_us) > _SUSPECT_US}
+        return self._peer_trajectories.silent(self._peers - self._ended, utc_us, _SUSPECT_US)
 
     def step(
         self, utc_us: int, state: VehicleState, phase: Phase, desired: DesiredReference, *, disturbance_ned_m_s2: Array
@@ -198,7 +197,7 @@ class Coordination:
             disturbance_ned_m_s2=disturbance_ned_m_s2,
         )
         commitments.evade(now)
-        commitments.evade(now, self._silent(utc_us, relied_on))
+        self._evade_silent(now, relied_on)
         unsure = {a for a in required & near if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
         self.alert = self._why_slow(unsure)
         if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
@@ -361,10 +360,6 @@ class Coordination:
         alive = self._bus.alive()
         return {agent for agent in self._peers if agent_name(agent) not in alive}
 
-    def _silence_us(self, agent: int, utc_us: int) -> int:
-        """Return the time since the newest message of a peer; 0 for one that has never been heard."""
-        return utc_us - self._peer_trajectories.received_utc_us.get(agent, utc_us)
-
     def _why_slow(self, unsure: Set[int]) -> str:
         if self._grip > Grip.OUTSIDE:
             return f"blown off what it had committed to: {self._grip.name.lower()}"
@@ -376,7 +371,8 @@ class Coordination:
         if by := self._membership.excluded_by:
             return f"excluded by {_names(by)} after silence"
         begun_us = utc_us if self._begun_us is None else self._begun_us
-        silent = [a for a in required if min(self._silence_us(a, utc_us), utc_us - begun_us) > _CUT_OFF_US]
+        silence_us = self._peer_trajectories.silence_us
+        silent = [a for a in required if min(silence_us(a, utc_us), utc_us - begun_us) > _CUT_OFF_US]
         return f"cut off from {_names(silent)}" if silent else ""
 
     def _others(
@@ -389,10 +385,15 @@ class Coordination:
             t0_utc_us, state.pos_ned_m, begin_ned_m, phase, without=without, encounters=encounters
         )
 
-    def _silent(self, utc_us: int, relied_on: Set[int]) -> KeepOuts:
-        """Return where vehicles of silent peers may be from now on."""
-        silence_us = {agent: self._silence_us(agent, utc_us) for agent in self._far_peers.near - self._ended}
-        return self._non_participants.silent(utc_us, silence_us, relied_on)
+    def _evade_silent(self, now: Situation, relied_on: Set[int]) -> None:
+        """Evade where vehicles of silent peers may be, or stop before the one of the only peer."""
+        near = self._far_peers.near - self._ended
+        silent = self._peer_trajectories.silent(near, now.utc_us, _SILENT_US)
+        doubted = self._non_participants.without_setpoints(silent & relied_on, now.utc_us)
+        if doubted and most_are_heard(silent, near):
+            self._commitments.evade_doubted(now, doubted)
+        elif doubted and not self._membership.may_be_excluded:
+            self._commitments.stop_before(now, doubted)
 
 
 def _names(agents: Iterable[int]) -> str:

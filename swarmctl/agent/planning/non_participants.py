@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Set
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +12,6 @@ from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, keep_out_of_commitment
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Phase
-
-_SILENT_US = 160_000  # four messages have not come, at the least
 
 
 class NonParticipants:
@@ -59,26 +57,26 @@ class NonParticipants:
         aged = (replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found)
         return encounters.noted(KeepOuts(aged, found.pos_ned_m) if found else found, begin_ned_m)
 
-    def silent(self, t0_utc_us: int, silence_us: Mapping[int, int], relied_on: Set[int]) -> KeepOuts:
-        """Return where vehicles are without setpoints, from `t0_utc_us` on, whose agents are silent while most are not.
+    def without_setpoints(self, agents: Set[int], t0_utc_us: int) -> KeepOuts:
+        """Return where vehicles of agents that fly by commitments are, from a time on, while no setpoint reaches them.
 
-        An agent that freezes, or is lost with its host, tells nobody, and its autopilot flies elsewhere. But while most
-        are silent it is rather the own link that is lost, or the bus: all fly on as they have committed to.
-
-        Args:
-            t0_utc_us: UTC of the first point.
-            silence_us: time since the newest message of each peer within reach.
-            relied_on: peers whose commitments are; the others are kept clear of anyway.
+        An agent that freezes, or is lost with its host, tells nobody, and its autopilot flies elsewhere.
         """
-        silent = {agent for agent, since_us in silence_us.items() if since_us > _SILENT_US}
-        doubted = silent & relied_on
-        if not doubted or 2 * (len(silence_us) - len(silent) + 1) <= len(silence_us) + 1:
+        if not agents:
             return KeepOuts()
         separation, budget = self._separation, self._separation.budget
-        ways = self._world_model.ways_without_setpoints(doubted, t0_utc_us, self._dt_us, self._steps)
+        ways = self._world_model.ways_without_setpoints(agents, t0_utc_us, self._dt_us, self._steps)
         return KeepOuts(keep_out_of_commitment(points, agent, separation, budget) for agent, points in ways.items())
 
     def ends(self, message: TrajectoryMessage) -> list[KeepOut]:
         """Return keep-outs where the trajectories end that a peer may follow."""
         ends = [np.tile(trajectory.pos_ned_m[-1], (2, 1)) for trajectory in message.followed]
         return [keep_out_of_commitment(end, message.agent, self._separation, self._separation.budget) for end in ends]
+
+
+def most_are_heard(silent: Set[int], peers: Set[int]) -> bool:
+    """Tell whether an agent and the peers that it hears are more than those that are silent.
+
+    Otherwise its own link may be lost, or the bus, and others fly on as they have committed to.
+    """
+    return len(peers - silent) + 1 > len(silent)

@@ -61,6 +61,11 @@ class Membership:
         """Return what is to be published."""
         return Exclusions(suspected=self._suspected, promised=self._promised)
 
+    @property
+    def may_be_excluded(self) -> bool:
+        """Return whether peers could ever exclude this agent: in a swarm of two the other one is no majority."""
+        return 2 * len(self._peers) > len(self._peers) + 1
+
     def update(
         self, suspected: Set[int], told: Mapping[int, Exclusions], ended: Set[int], *, votes: bool = True
     ) -> None:

@@ -55,6 +55,12 @@ The proof rests on these assumptions, each of which is watched in flight:
   silent while most are heard. Two that evade at once may conflict. An agent that finds a peer's commitment in conflict
   with its own (`conflicting_peers`), or a peer outside its tube, keeps clear of that peer as of one that does not take
   part.
+- In a swarm of two nobody can tell which of the two is cut off, so who meets the vehicle of a silent peer stops along
+  its own places (`stop_before`), if all of these are apart from all places of what the peer is known to have committed
+  to or to propose, whenever it passes them. This needs no acknowledgement: what the peer commits to later it has
+  proposed before, and this agent has acknowledged, so it is known; or the peer knows of the stop. If it stops likewise,
+  it does so within those places. With more than two it would not do: a majority that has never heard of the stop may
+  exclude the agent, and rely on its going on.
 - Every agent takes part. A vehicle that does not (a pilot flies it, its agent has died) is a keep-out of the
   best-effort kind. A silent peer stays a participant; when one is left out is in `swarmctl.control.commit.membership`:
   it takes evidence or a majority. The events `membership` and `operator` say who was, and on whose word.
@@ -123,6 +129,9 @@ class Planner(Protocol):
 
     def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """Return a trajectory that keeps more distance to everything known than `committed`; None if none is found."""
+
+    def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
+        """Return `committed`, stopped along its own places, which others do not pass; None if that gains nothing."""
 
 
 class Commitments:
@@ -230,33 +239,53 @@ class Commitments:
         unsure = {agent: t for agent, t in commitments.items() if any(t is other for other in new)}
         return {a for a, t in unsure.items() if self._planner.conflicts(self.committed, utc_us, [by_exact_clock(t)])}
 
-    def evade(self, now: Situation, doubted: KeepOuts | None = None) -> None:
+    def evade(self, now: Situation) -> None:
         """Replace the committed trajectory without acknowledgement, where waiting for one would be too late.
 
         It is replaced only when it hits a keep-out and so does braking `_EVASION_DELAY_S` after the lead.
-
-        Args:
-            now: a plan that begins at once, and keep-outs from now on.
-            doubted: further keep-outs, of peers that may as well fly as they have committed to: nothing is evaded to
-                that conflicts with anything known. None: none, and what does not take part is more important.
         """
         flown = self.flown
-        if doubted is not None:
-            if not doubted:
-                return
-            now = replace(now, others=KeepOuts([*now.others, *doubted]))
-        if flown is None or not now.others or self._planner.is_clear(flown, now):
+        if flown is None or not now.others or self._planner.is_clear(flown, now) or self._may_wait(flown, now):
             return
-        later_us = now.utc_us + self.lead_us + round(_EVASION_DELAY_S * 1e6)
-        if self._planner.is_clear(self._planner.stopping_candidate(flown, later_us, now.utc_us), now):
+        if (evasive_trajectory := self._planner.evasive_trajectory(flown, now)) is not None:
+            self._replace(evasive_trajectory)
+            self.counts.evasive += 1
+
+    def evade_doubted(self, now: Situation, doubted: KeepOuts) -> None:
+        """Evade vehicles whose agents are silent, which may as well fly as they have committed to.
+
+        So nothing is evaded to that conflicts with anything known.
+
+        Args:
+            now: as for `evade`.
+            doubted: keep-outs of those vehicles.
+        """
+        flown, now = self.flown, replace(now, others=KeepOuts([*now.others, *doubted]))
+        if flown is None or self._planner.is_clear(flown, now) or self._may_wait(flown, now):
             return
         evasive_trajectory = self._planner.evasive_trajectory(flown, now)
-        if evasive_trajectory is None:
+        if evasive_trajectory is not None and not self._planner.conflicts(evasive_trajectory, now.utc_us, now.followed):
+            self._replace(evasive_trajectory)
+            self.counts.evasive += 1
+
+    def stop_before(self, now: Situation, doubted: KeepOuts) -> None:
+        """Stop along the own places before vehicles whose agents are silent; see the proof.
+
+        Args:
+            now: as for `evade`; its peers are all that may be flying as they have committed to.
+            doubted: keep-outs of those vehicles.
+        """
+        flown, now = self.flown, replace(now, others=KeepOuts([*now.others, *doubted]))
+        if flown is None or self._planner.is_clear(flown, now):
             return
-        if doubted and self._planner.conflicts(evasive_trajectory, now.utc_us, now.followed):
-            return
-        self._replace(evasive_trajectory)
-        self.counts.evasive += 1
+        if (halting := self._planner.halting(flown, now)) is not None:
+            self._replace(halting)
+            self.counts.evasive += 1
+
+    def _may_wait(self, flown: Trajectory, now: Situation) -> bool:
+        """Tell whether braking `_EVASION_DELAY_S` after the lead is still clear of all keep-outs."""
+        later_us = now.utc_us + self.lead_us + round(_EVASION_DELAY_S * 1e6)
+        return self._planner.is_clear(self._planner.stopping_candidate(flown, later_us, now.utc_us), now)
 
     def is_due(self, utc_us: int) -> bool:
         """Tell whether there is no proposal and `period_s` has passed since the last attempt."""

@@ -20,6 +20,7 @@ from swarmctl.control.collision.separation import (
     keep_out_of_commitment,
 )
 from swarmctl.control.commit.commit_params import CommitParams, planning
+from swarmctl.control.commit.halting import halted, places_apart_m
 from swarmctl.control.commit.situation import Situation, with_run_up
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.controller_setup import ControllerSetup
@@ -38,6 +39,9 @@ _LEAST_COS_TILT = 0.5  # at the start of a plan, as its bounds on tilt allow
 _CLIMB_M_S, _CLIMB_M_S2 = 2.0, 2.0
 _WAY_S, _WAY_M_S, _WAY_M_S2 = 1.0, 0.5, 0.5  # how far ahead on a path around something, and how fast it is gone to
 _WAY_TURNS_RAD = (0.0, 0.3, -0.3, 0.6, -0.6)
+_HALT_DELAY_S = 0.6  # a stop along the own places that begins so much later must still be clear, or one begins sooner
+_HALTS_AFTER_S = (0.4, 0.2, 0.0)
+_UNSURE_M = 0.3  # of where vehicles are after 2 s without setpoints, as measured
 _BRAKING_TAIL_S = 2.0  # part of the final braking that is checked against keep-outs
 _OUTWARD_TOLERANCE_M = (
     0.01  # farther out of the flight volume allowed to proposals of a vehicle that is outside already
@@ -137,6 +141,25 @@ class TrajectoryPlanner:
         """Tell whether a trajectory comes too close to any of `known` between `utc_us` and when all are at rest."""
         return not self._margin_m(trajectory, utc_us, known, spare_m) >= 0.0
 
+    def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
+        """Return `committed`, stopped along its own places, which others do not pass; None if that gains nothing.
+
+        See `swarmctl.control.commit.halting`. While one that begins `_HALT_DELAY_S` later still is clear, it gains
+        nothing either. Otherwise the latest and softest is returned that is clear, or else the one with most distance.
+        """
+        later = self._halting_candidates(committed, now, _HALT_DELAY_S)
+        if any(self._clearance_m(candidate, now) >= _UNSURE_M for candidate in later):
+            return None
+        best, best_m = None, self._clearance_m(committed, now) + _MIN_GAIN_M
+        for after_s in _HALTS_AFTER_S:
+            for candidate in self._halting_candidates(committed, now, after_s):
+                found_m = self._clearance_m(candidate, now)
+                if found_m >= _UNSURE_M:
+                    return candidate
+                if found_m > best_m:
+                    best, best_m = candidate, found_m
+        return best
+
     def stopping_from(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> Trajectory:
         """Return the trajectory that brakes straight ahead from a position (3,) and velocity (3,).
 
@@ -163,6 +186,15 @@ class TrajectoryPlanner:
         heights_m = [k.radius_m for k in now.others if not k.any_height]
         if heights_m:
             yield self._climbing_candidate(committed, now.begin_us, max(heights_m) + INTERPOLATION_MARGIN_M)
+
+    def _halting_candidates(self, committed: Trajectory, now: Situation, after_s: float) -> Iterator[Trajectory]:
+        """Yield stops along the committed trajectory that begin so much later and need no acknowledgement."""
+        least_m = self._budget.committed_m + INTERPOLATION_MARGIN_M
+        begin_us, downwash = now.utc_us + round(1e6 * after_s), self._separation.downwash
+        for brake_m_s2 in (self._params.brake_m_s2, self._hardest_m_s2):
+            found = halted(committed, begin_us, now.utc_us, self.dt_us, brake_m_s2)
+            if found and places_apart_m(found, begin_us, now.followed, now.utc_us, downwash) >= least_m:
+                yield found
 
     def _climbing_candidate(self, committed: Trajectory, begin_us: int, height_m: float) -> Trajectory:
         """Return the committed trajectory, left at `begin_us` for a climb by `height_m` over where it would stop."""

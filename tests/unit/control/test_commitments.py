@@ -77,9 +77,7 @@ def test_before_what_is_merely_doubted_nothing_is_evaded_to_that_conflicts_with_
         desired=DesiredReference(at_goal),
         peers=message_of(second, 1) if followed else {},
     )
-    first.evade(now, KeepOuts())
-    assert first.counts.evasive == 0, "nobody is doubted"
-    first.evade(now, KeepOuts([wall(1.6, first)]))
+    first.evade_doubted(now, KeepOuts([wall(1.6, first)]))
     assert first.counts.evasive == (0 if followed else 1)
 
 

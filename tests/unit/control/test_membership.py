@@ -191,3 +191,15 @@ def test_an_agent_started_amid_a_flight_promises_nothing() -> None:
     assert membership.exclusions == Exclusions()
     membership.update({2}, told, NOBODY)
     assert membership.exclusions.promised == {2}
+
+
+@pytest.mark.parametrize("peers", [1, 2, 3])
+def test_who_is_one_of_two_is_never_excluded(peers: int) -> None:
+    """The only peer is no majority, however long it does not hear this agent; two that agree are one."""
+    agent = Membership(0, range(1, peers + 1))
+    others = {i: Membership(i, {0, *range(1, peers + 1)} - {i}) for i in range(1, peers + 1)}
+    for _ in range(3):
+        told = {i: other.exclusions for i, other in others.items()}
+        for i, other in others.items():
+            other.update({0}, {j: told[j] for j in told.keys() - {i}}, NOBODY)
+    assert agent.may_be_excluded is any(0 in other.excluded for other in others.values()) is (peers > 1)
