@@ -139,7 +139,7 @@ def test_others_keep_clear_of_one_whose_agent_is_silent_while_they_hear_each_oth
 ) -> None:
     """Its host is lost, say. By what all have committed to, which it does not fly any more, bodies touch."""
     assert without_an_agent(at_s=at_s, is_frozen=True) >= 0.85
-    monkeypatch.setattr(NonParticipants, "silent", lambda *_: KeepOuts())
+    monkeypatch.setattr(NonParticipants, "without_setpoints", lambda *_: KeepOuts())
     assert without_an_agent(at_s=at_s, is_frozen=True) < 0.48, "negative control: bodies touch"
 
 
