@@ -86,16 +86,17 @@ def status_message(
     altitude_m: float = 5.0,
     utc_us: int = 0,
 ) -> StatusMessage:
-    """Return the status of an agent that tracks its mission."""
+    """Return the status of an agent that tracks its mission, or is in another phase; one that is done has landed."""
+    is_done = phase == Phase.DONE
     return StatusMessage(
         agent=agent,
         boot_id=1,
         sysid=agent + 1,
         phase=phase,
         mode=Mode.TRACKING,
-        flight_mode=FlightMode.EXTERNAL,
-        armed=True,
-        landed=Landed.IN_AIR,
+        flight_mode=FlightMode.LAND if is_done else FlightMode.EXTERNAL,
+        armed=not is_done,
+        landed=Landed.ON_GROUND if is_done else Landed.IN_AIR,
         held=held,
         control=control,
         altitude_m=altitude_m,

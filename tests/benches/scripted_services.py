@@ -92,6 +92,7 @@ class ScriptedServices(Services):
         self.phase = Phase.TRACK
         self.phases: dict[int, Phase] = {}  # of agents whose phase is another one
         self.held = False
+        self.vehicle: dict[str, object] = {}  # what statuses say otherwise of vehicles
         self.ends_s: float | None = None  # monotonic time at which what all agents fly ends by itself
         self.act: Callable[[], None] = lambda: None
         self.began_s = time.monotonic()
@@ -139,7 +140,9 @@ class ScriptedServices(Services):
                 ends_in_s = status.ends_in_s if self.ends_s is None else self.ends_s - time.monotonic()
                 bus.publish(
                     STATUS,
-                    encode_message(msgspec.structs.replace(status, boot_id=self.boot_ids[i], ends_in_s=ends_in_s)),
+                    encode_message(
+                        msgspec.structs.replace(status, boot_id=self.boot_ids[i], ends_in_s=ends_in_s, **self.vehicle)
+                    ),
                 )
         if time.monotonic() - self.began_s > 0.3:
             act, self.act = self.act, lambda: None

@@ -26,7 +26,7 @@ from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import ENDED, OBSTACLES, OPERATOR, Topic
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import Phase
+from swarmctl.core.types import Landed, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child
 from swarmctl.ops.supervision.hearing import Hearing
@@ -138,6 +138,18 @@ def test_ends_are_told_again_and_again_each_by_its_process(tmp_path: Path) -> No
     told = Counter((end.boot_id, end.is_down) for end in scene.ended if end.agent == 1)
     assert told.keys() == {(1, False), (2, True)}, "the second process has landed the vehicle of the first"
     assert min(told.values()) >= 3
+
+
+@pytest.mark.parametrize("agent", [ends(0, 1.0), ends(1, 1.0)])
+def test_a_vehicle_that_was_handed_over_in_the_air_is_left_there_and_named_but_not_said_to_be_down(
+    tmp_path: Path, agent: str
+) -> None:
+    scene = ScriptedServices(tmp_path, [ends(0, 1.5), agent])
+    scene.phases, scene.vehicle = {1: Phase.DONE}, {"armed": True, "landed": Landed.IN_AIR}
+    scene.fly()
+    assert scene.recovered == []
+    assert scene.printed("vehicle 2 (agent-1)", "was left to its autopilot", "No agent lands it")
+    assert [end.is_down for end in scene.ended if end.agent == 1][:1] == [False]
 
 
 def test_a_vehicle_that_can_not_be_recovered_is_named(tmp_path: Path) -> None:

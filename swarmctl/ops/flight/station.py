@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.messages.json_messages import ObstaclesMessage, StatusMessage
+from swarmctl.bus.messages.json_messages import EndedMessage, ObstaclesMessage, StatusMessage
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.topics import TICK
@@ -34,7 +34,7 @@ from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.supervision.own_pause import OwnPause
-from swarmctl.ops.supervision.recovery import RECOVERY_S
+from swarmctl.ops.supervision.recovery import RECOVERY_S, hand_over_in_words, is_done
 from swarmctl.ops.supervision.sender_clocks import SenderClocks
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
@@ -157,7 +157,7 @@ class SwarmWatch:
                 self._take_status(self._views[status.agent], status, now_s)
         for ended in self._report.ends(self._ends):
             if not ended.is_down:
-                self._died.setdefault(ended.agent, f"{agent_name(ended.agent)} died before its vehicle was down")
+                self._take_early_end(ended)
         self._keep_obstacles()
         self._report.step()
         self._display.show(self._views)
@@ -189,6 +189,14 @@ class SwarmWatch:
         self._compare_code(status)
         if _flies(status):
             self._flying.add(status.agent)
+
+    def _take_early_end(self, ended: EndedMessage) -> None:
+        """Note that a process has ended before its vehicle was down: it died, or was done and has handed that over."""
+        status = self._views[ended.agent].status
+        if status is not None and status.boot_id == ended.boot_id and is_done(status):
+            self._say("handed_over", hand_over_in_words(status), agent=ended.agent)
+        else:
+            self._died.setdefault(ended.agent, f"{agent_name(ended.agent)} died before its vehicle was down")
 
     def _compare_code(self, status: StatusMessage) -> None:
         """Say once that an agent flies another swarmctl than this station; agents compare theirs with one another."""
@@ -270,7 +278,7 @@ class SwarmWatch:
 
 
 def _is_done(view: AgentView) -> bool:
-    return view.status is not None and view.status.phase == Phase.DONE
+    return view.status is not None and is_done(view.status)
 
 
 def _last_phase(view: AgentView) -> str:

@@ -2,7 +2,8 @@
 
 A second agent is started on the same link. It only lands the vehicle and waits for the HEARTBEAT that reports it as
 disarmed; the autopilot's own failsafes act meanwhile. A vehicle that can't be recovered is named, so that no launch
-ends with an armed vehicle unreported.
+ends with an armed vehicle unreported. So is one that an agent which was done has left in the air, to its autopilot or
+to a pilot: from those it is not taken.
 """
 
 from __future__ import annotations
@@ -11,13 +12,13 @@ import time
 from collections.abc import Callable, Sequence
 
 from swarmctl.bus.messages.json_messages import StatusMessage
-from swarmctl.core.types import Phase
+from swarmctl.core.types import FlightMode, Landed, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.processes import Child
 from swarmctl.ops.supervision.status_table import AgentView, name_of
 
 RECOVERY_S = 90.0  # a failsafe that returns home first needs most of it
-_DOWN = (EXIT_OK, EXIT_INTERRUPTED)  # an agent ends with these only when its vehicle is down
+_DOWN = (EXIT_OK, EXIT_INTERRUPTED)  # an agent ends with these only when it is done
 
 
 class Recovery:
@@ -43,18 +44,23 @@ class Recovery:
         return agent in self._begun_s and time.monotonic() - self._begun_s[agent] > RECOVERY_S
 
     def leaves_down(self, view: AgentView, code: int) -> bool:
-        """Return whether an agent that ends with this code is known to leave its vehicle on the ground and disarmed."""
-        if code in _DOWN or (code == EXIT_START and not self.is_on(view.agent)):
-            return True
-        return view.status is not None and view.status.phase == Phase.DONE
+        """Return whether an agent that ends with this code is known to leave its vehicle on the ground and disarmed.
+
+        One that is done may have left it in the air, so what it has told of the vehicle decides.
+        """
+        if view.status is not None and is_done(view.status):
+            return _stands(view.status)
+        return code in _DOWN or (code == EXIT_START and not self.is_on(view.agent))
 
     def begin(self, view: AgentView, code: int) -> Child | None:
         """Register an ended agent; return the process that recovers its vehicle, or None.
 
+        Who is done with a vehicle in the air has left it to somebody, and may have been asked to: it is not recovered.
+
         Raises:
             StartError, OSError: it can't be started; the vehicle counts as lost.
         """
-        if self.leaves_down(view, code):
+        if self.leaves_down(view, code) or handed_over(view):
             return None
         if self.is_on(view.agent) or view.status is None:
             self._lost |= {view.agent} if view.status is not None else set()
@@ -72,10 +78,10 @@ class Recovery:
         return [self._words(view) for view in views if view.agent in self._lost]
 
     def give_up(self, views: Sequence[AgentView]) -> None:
-        """Count every vehicle whose agent is killed before it was done as lost; so who was to be landed and was not."""
+        """Count every vehicle whose agent is killed before it was down as lost; so who was to be landed and was not."""
         for view in views:
             status, _, _ = self._last_known(view)
-            if status is not None and Phase.ARM <= status.phase < Phase.DONE:
+            if status is not None and status.phase >= Phase.ARM and not (is_done(status) and _stands(status)):
                 self._lost.add(view.agent)
 
     def _last_known(self, view: AgentView) -> tuple[StatusMessage | None, float, bool]:
@@ -96,3 +102,30 @@ class Recovery:
             f"{name_of(Phase, status.phase)}, {time.monotonic() - received_s:.0f} s ago{since}. "
             "Land and disarm it by hand"
         )
+
+
+def is_done(status: StatusMessage) -> bool:
+    """Return whether an agent does nothing more for its vehicle, wherever that is."""
+    return status.phase == Phase.DONE
+
+
+def _stands(status: StatusMessage) -> bool:
+    """Return whether a vehicle has told that it is on the ground and disarmed."""
+    return not status.armed and status.landed == Landed.ON_GROUND
+
+
+def handed_over(view: AgentView) -> str:
+    """Return in words that an ended agent was done with a vehicle that is not known to be down; else ""."""
+    if view.status is None or not is_done(view.status) or _stands(view.status):
+        return ""
+    return hand_over_in_words(view.status)
+
+
+def hand_over_in_words(status: StatusMessage) -> str:
+    """Return where an agent that was done and has ended has left a vehicle that is not known to be down."""
+    armed = "armed" if status.armed else "disarmed"
+    place = "on the ground" if status.landed == Landed.ON_GROUND else "not known to be on the ground"
+    return (
+        f"vehicle {status.sysid} (agent-{status.agent}) was left to its autopilot, or to who flies it: {armed}, "
+        f"{place}, in {name_of(FlightMode, status.flight_mode)}. No agent lands it"
+    )

@@ -29,7 +29,7 @@ from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.supervision.own_pause import OwnPause
-from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery
+from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery, handed_over
 from swarmctl.ops.supervision.standstill import Standstill
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
@@ -237,7 +237,8 @@ class FlightSupervisor:
 
     def _recover(self, view: AgentView, code: int) -> None:
         """Start another process that lands a vehicle which is not known to be down."""
-        if self._recovery.is_on(view.agent) and code == EXIT_INTERRUPTED:
+        is_down = self._recovery.leaves_down(view, code)
+        if self._recovery.is_on(view.agent) and code == EXIT_INTERRUPTED and is_down:
             self._announce("recovered", f"the vehicle of {agent_name(view.agent)} is on the ground and disarmed")
         try:
             child = None if self._vehicles_lost else self._recovery.begin(view, code)
@@ -245,6 +246,8 @@ class FlightSupervisor:
             self._fail("recovery_failed", f"the vehicle of {agent_name(view.agent)} can't be recovered: {error}")
             return
         if child is None:
+            if not self._vehicles_lost and (words := handed_over(view)):
+                self._announce("handed_over", words)
             return
         self._services.children[agent_name(view.agent)] = child
         view.note, view.received_s = "recovering", time.monotonic()

@@ -346,6 +346,25 @@ def test_who_died_is_named_also_where_its_vehicle_never_left_the_ground(watched:
     assert (watched.watch.problems, watched.watch.was_stopped) == (died, False)
 
 
+def test_who_has_completed_its_mission_and_handed_its_vehicle_over_in_the_air_has_not_died(watched: Watched) -> None:
+    assert not watched.run(2.0, ALL_TRACK)
+    assert not watched.run(2.0, dict.fromkeys(range(3), Phase.DONE))
+    watched.end(1, is_down=False)
+    assert watched.run(5.0, {})
+    assert watched.watch.problems == []
+    assert "vehicle 2 (agent-1) was left to its autopilot" in watched.said.getvalue()
+
+
+def test_another_process_that_was_done_does_not_excuse_one_that_died(watched: Watched) -> None:
+    assert not watched.run(2.0, {1: Phase.STANDBY}, armed=False)
+    assert not watched.run(2.0, {1: Phase.DONE}, starts=2)
+    watched.end(1, is_down=False)
+    assert not watched.run(2.0, OTHERS_TRACK)
+    assert not watched.run(2.0, OTHERS_DONE)
+    assert watched.run(5.0, {})
+    assert watched.watch.problems == ["agent-1 died before its vehicle was down"]
+
+
 def test_only_who_runs_an_agent_says_that_it_has_ended(watched: Watched) -> None:
     assert not watched.run(2.0, {1: Phase.STANDBY}, armed=False)
     assert not watched.run(2.0, OTHERS_TRACK)

@@ -9,10 +9,10 @@ from typing import cast
 import msgspec
 import pytest
 
-from swarmctl.core.types import Phase
+from swarmctl.core.types import FlightMode, Landed, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.processes import Child
-from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery
+from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery, handed_over
 from swarmctl.ops.supervision.status_table import AgentView
 from tests import builders
 
@@ -55,8 +55,43 @@ def test_an_agent_that_ends_so_leaves_its_vehicle_down(code: int) -> None:
     assert not found.is_on(1) and found.left([seen()]) == []
 
 
-def test_an_agent_that_was_done_leaves_its_vehicle_down_however_it_ends() -> None:
-    assert Recovery(lambda _: CHILD, (1, 2, 3)).leaves_down(seen(Phase.DONE), KILLED)
+@pytest.mark.parametrize("code", [EXIT_OK, EXIT_INTERRUPTED, EXIT_START, EXIT_MISSION, KILLED])
+def test_an_agent_that_was_done_on_the_ground_leaves_its_vehicle_down_however_it_ends(code: int) -> None:
+    found, view = Recovery(lambda _: CHILD, (1, 2, 3)), seen(Phase.DONE)
+    assert found.leaves_down(view, code)
+    assert handed_over(view) == ""
+
+
+@pytest.mark.parametrize("code", [EXIT_OK, EXIT_INTERRUPTED, EXIT_START, EXIT_MISSION, KILLED])
+@pytest.mark.parametrize(
+    ("armed", "landed", "words"),
+    [
+        (True, Landed.IN_AIR, "armed, not known to be on the ground"),
+        (False, Landed.IN_AIR, "disarmed, not known to be on the ground"),
+        (True, Landed.ON_GROUND, "armed, on the ground"),
+        (False, Landed.UNKNOWN, "disarmed, not known to be on the ground"),
+    ],
+)
+def test_who_was_done_with_a_vehicle_that_is_not_down_vouches_for_nothing_and_takes_it_from_nobody(
+    code: int, *, armed: bool, landed: Landed, words: str
+) -> None:
+    """As one that was found in the air and handed back in a hold, or one that a pilot has armed again since."""
+    found, view = Recovery(lambda _: CHILD, (1, 2, 3)), seen(Phase.DONE)
+    assert view.status is not None
+    view.status = msgspec.structs.replace(view.status, armed=armed, landed=landed, flight_mode=FlightMode.HOLD)
+    assert not found.leaves_down(view, code)
+    assert found.begin(view, code) is None
+    assert handed_over(view) == (
+        f"vehicle 2 (agent-1) was left to its autopilot, or to who flies it: {words}, in HOLD. No agent lands it"
+    )
+
+
+def test_of_a_vehicle_that_was_handed_over_in_the_air_it_is_told_when_all_is_killed() -> None:
+    found, view = Recovery(lambda _: CHILD, (1, 2, 3)), seen(Phase.DONE)
+    assert view.status is not None
+    view.status = msgspec.structs.replace(view.status, armed=True, landed=Landed.IN_AIR)
+    found.give_up([view])
+    assert len(found.left([view])) == 1
 
 
 def test_of_an_agent_that_was_never_heard_nothing_is_recovered_and_nothing_claimed() -> None:
@@ -137,7 +172,7 @@ def recovered(view: AgentView, phase: Phase | None) -> Recovery:
     view.received_s = time.monotonic()  # as the supervisor does, from when on it waits for that process
     if phase is not None:
         heard = builders.status_message(phase=phase)
-        view.status = msgspec.structs.replace(heard, boot_id=2, armed=phase != Phase.CONNECT)
+        view.status = msgspec.structs.replace(heard, boot_id=2, armed=Phase.CONNECT < phase < Phase.DONE)
     return recovery
 
 
