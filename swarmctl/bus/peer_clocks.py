@@ -76,7 +76,8 @@ class PeerClocks:
 
     Args:
         peers: their numbers.
-        note: is told `clock_offset` with `agent`, `ahead_s` and the `error_s` it may have, when a correction changes.
+        note: is told `clock_offset` with `agent`, `ahead_s` and the `error_s` it may have, when a correction changes,
+            and `clock_gone_back` with `agent` and `by_s`.
         trusts_equal: whether clocks that may be equal are taken for equal without room for an error.
 
     Attributes:
@@ -87,6 +88,7 @@ class PeerClocks:
         self._clocks = {agent: _PeerClock() for agent in peers}
         self._note, self._trusts_equal = note, trusts_equal
         self._refused_us: dict[int, int] = {}  # by peer: how far a refused message was ahead
+        self._gone_back_us: dict[int, int] = {}  # by peer: how far its clock has gone back, as refused messages show
         self.alert = ""
 
     def received(self, agent: int, sent_utc_us: int, utc_us: int) -> None:
@@ -99,6 +101,21 @@ class PeerClocks:
         """Take in that a message was refused now, because the stamp of the peer is too far ahead to allow for."""
         self._refused_us[agent] = sent_utc_us - utc_us
         self.alert = self._farthest_off()
+
+    def gone_back(self, agent: int, by_us: int) -> None:
+        """Take in that messages were refused as if repeated, because the clock of the peer has gone back, as it seems.
+
+        It is told once, and is the alert until the peer is believed again.
+        """
+        if agent not in self._gone_back_us:
+            self._gone_back_us[agent] = by_us
+            self._note("clock_gone_back", agent=agent, by_s=by_us / 1e6)
+            self.alert = self._farthest_off()
+
+    def believed(self, agent: int) -> None:
+        """Take in that a message of a peer was accepted."""
+        if self._gone_back_us.pop(agent, None) is not None:
+            self.alert = self._farthest_off()
 
     def answered(self, agent: int, sent_utc_us: int, received_utc_us: int, utc_us: int) -> None:
         """Take in when a peer, by its clock, received the own message stamped `sent_utc_us`."""
@@ -131,6 +148,13 @@ class PeerClocks:
             self.alert = self._farthest_off()
 
     def _farthest_off(self) -> str:
+        if self._gone_back_us:
+            agent, by_us = max(self._gone_back_us.items(), key=lambda item: item[1])
+            name = agent_name(agent)
+            return (
+                f"clock of {name} may have gone back by {by_us * 1e-6:.1f} s, as it started again: what it says looks "
+                f"like what was said before, and is not believed. {_ADVICE}, then start {name} again"
+            )
         if self._refused_us:
             agent, ahead_us = max(self._refused_us.items(), key=lambda item: item[1])
             return f"{_apart(agent, ahead_us)}, which is too far: nothing it says is believed. {_ADVICE}"

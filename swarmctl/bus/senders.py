@@ -21,6 +21,11 @@ both orders work: messages that overtake the token are a claim until it appears,
 process (sent before the token appeared, by their stamp) do not count as a continued stream. A forger that continues
 the newest message exactly as its sender would cannot be detected without signatures. It leaves traces, because one
 number then has two contents.
+
+Messages of another boot id that are stamped before the accepted stream began are refused as replayed, whatever else
+speaks for them: a recording of an earlier process is just that. So is what a restarted process says by a clock that was
+set back, until that clock has passed the begin of the process before. They are never accepted for it, but
+`SenderVerifier.gone_back_us` tells of them where nothing else is heard of a sender that is on the bus.
 """
 
 from __future__ import annotations
@@ -124,6 +129,7 @@ class SenderVerifier:
         self._refusals, self._presence = refusals, presence
         self._accepted: _Stream | None = None
         self._claims: list[_Stream] = []
+        self._past: _Stream | None = None  # refused messages of another process, stamped before the accepted one's
         self._contents: dict[int, int] = {}  # checksums of accepted messages, by number
 
     def accepts(self, received: ReceivedMessage, utc_us: int) -> bool:
@@ -145,6 +151,20 @@ class SenderVerifier:
         checksum = zlib.crc32(received.payload)
         return self._contents.get(received.seq, checksum) == checksum
 
+    def gone_back_us(self, utc_us: int) -> int:
+        """Return by how much the sender's clock was set back between two processes, as it seems; 0: nothing says so.
+
+        It seems so while messages of another process, which continue one another, are all that is heard of a sender
+        that is on the bus, and are refused because they are stamped before the accepted ones began.
+        """
+        past, accepted = self._past, self._accepted
+        if past is None or accepted is None or past.count < CONFIRMATIONS:
+            return 0
+        if utc_us - accepted.received_utc_us < SILENCE_US or self._presence.since_us(self._sender) is None:
+            return 0
+        delays_us = [stream.received_utc_us - stream.sent_utc_us for stream in (past, accepted)]
+        return max(0, delays_us[0] - delays_us[1])
+
     def _refusal(self, received: ReceivedMessage, utc_us: int) -> str:
         accepted = self._accepted
         if accepted is None:
@@ -158,14 +178,24 @@ class SenderVerifier:
         same_boot = received.boot_id == accepted.boot_id
         if same_boot and received.seq in self._contents:
             return REPLAYED if self._contents[received.seq] == zlib.crc32(received.payload) else SEQUENCE
-        repeats = same_boot and received.seq <= accepted.seq and received.sent_utc_us <= accepted.sent_utc_us
-        if repeats or (not same_boot and received.sent_utc_us <= accepted.began_utc_us):  # or of an earlier process
+        if same_boot and received.seq <= accepted.seq and received.sent_utc_us <= accepted.sent_utc_us:
+            return REPLAYED
+        if not same_boot and received.sent_utc_us <= accepted.began_utc_us:  # of an earlier process, by its stamp
+            self._follow_past(received, utc_us)
             return REPLAYED
         claim = self._claim(received, utc_us)
         if not self._is_confirmed(claim, accepted, utc_us):
             return UNCONFIRMED
-        self._accepted, self._claims, self._contents = claim, [], {}
+        self._accepted, self._claims, self._past, self._contents = claim, [], None, {}
         return ""
+
+    def _follow_past(self, received: ReceivedMessage, utc_us: int) -> None:
+        """Note a message that is refused for its stamp; copies of it, and others out of order, change nothing."""
+        past = self._past
+        if past is None or past.boot_id != received.boot_id:
+            self._past = _new_stream(received, utc_us)
+        elif past.continues(received, utc_us, self._rate_hz):
+            past.take(received, utc_us)
 
     def _claim(self, received: ReceivedMessage, utc_us: int) -> _Stream:
         """Return the claim that a message continues, or a new one in place of the one with the fewest messages."""

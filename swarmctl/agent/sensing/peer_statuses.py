@@ -91,8 +91,12 @@ class PeerStatuses:
             return None
         stamp_us = min(status.utc_us, utc_us + MAX_LEAD_US)  # a clock that is ahead is measured, and not refused
         message = ReceivedMessage(status.boot_id, status.ticks, stamp_us, payload)
-        if not self._verifiers[status.agent].accepts(message, utc_us):
+        verifier = self._verifiers[status.agent]
+        if not verifier.accepts(message, utc_us):
+            if back_us := verifier.gone_back_us(utc_us):
+                self._clocks.gone_back(status.agent, back_us)
             return None
+        self._clocks.believed(status.agent)
         self._newest[status.agent], self._heard_us[status.agent], self._ended = status, utc_us, None
         if not status.uses_commitments:  # trajectory messages say more of the clocks of those that commit
             self._measure_clock(status, utc_us)

@@ -295,6 +295,76 @@ def test_in_best_effort_statuses_measure_clocks_by_which_paths_and_ready_times_a
     assert bench.world_model.statuses.next_lags_us(bench.clock.utc_us()) == {}, "a clock drifts"
 
 
+def restarted(back_us: int, seconds: float, *, copies: int = 1) -> Bench:
+    """Return who has heard agent 1 for two seconds, and since then another process of it, by a clock that was set back.
+
+    Args:
+        back_us: by how much.
+        seconds: for how long it has spoken.
+        copies: of each status, as over several ways.
+    """
+    bench = Bench()
+    for _ in range(10):
+        bench.seq += 10
+        bench.say_status(boot_id=70, uses_commitments=False)
+        for _ in range(10):
+            bench.tick()
+    bench.peer.close()
+    for _ in range(50):
+        bench.tick()
+    bench.peer, bench.seq = bench.hub.connect(agent_name(1)), 0
+    for _ in range(round(5 * seconds)):
+        bench.seq += 10
+        for _ in range(copies):
+            bench.say_status(boot_id=60, utc_us=bench.clock.utc_us() - back_us, uses_commitments=False)
+        for _ in range(10):
+            bench.tick()
+    return bench
+
+
+def gone_back(bench: Bench) -> list[dict[str, Any]]:
+    return [event for event in bench.events if event["event"] == "clock_gone_back"]
+
+
+@pytest.mark.parametrize("copies", [1, 2])
+def test_a_restart_by_a_clock_that_has_gone_back_is_told_once_with_what_to_do(copies: int) -> None:
+    """What it says looks like what was said before: it is refused, as that could be sent again by anybody."""
+    bench = restarted(8_000_000, 4.0, copies=copies)
+    assert bench.rejected == {"replayed": 20 * copies}
+    assert bench.world_model.statuses.boot_id(1) == 70
+    (told,) = gone_back(bench)
+    assert told["agent"] == 1
+    assert told["by_s"] == pytest.approx(8.0, abs=0.1)
+    alert = bench.world_model.clocks.alert
+    assert alert.startswith("clock of agent-1 may have gone back by 8.0 s"), alert
+    assert "Set the clocks of the hosts (chrony, PTP), then start agent-1 again" in alert
+
+
+def test_a_clock_that_has_gone_back_is_told_of_until_its_peer_is_believed() -> None:
+    bench = restarted(8_000_000, 10.0)
+    assert bench.world_model.statuses.boot_id(1) == 60, "its clock has passed the begin of the process before"
+    assert len(gone_back(bench)) == 1
+    assert "gone back" not in bench.world_model.clocks.alert
+
+
+def test_a_restart_by_a_clock_that_has_not_gone_back_tells_nothing_of_it() -> None:
+    bench = restarted(0, 4.0)
+    assert bench.world_model.statuses.boot_id(1) == 60
+    assert gone_back(bench) == []
+
+
+def test_what_an_ended_process_has_said_comes_again_beside_the_one_that_follows_and_tells_nothing_of_clocks() -> None:
+    bench, seq = restarted(0, 2.0), 0
+    for _ in range(20):
+        seq, bench.seq = seq + 10, bench.seq + 10
+        bench.say_status(boot_id=50, ticks=seq, utc_us=bench.clock.utc_us() - 30_000_000)
+        bench.say_status(boot_id=60)
+        for _ in range(10):
+            bench.tick()
+    assert bench.rejected["replayed"] == 20
+    assert gone_back(bench) == []
+
+
 def test_a_status_that_comes_while_the_agent_is_held_up_says_nothing_of_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Between the begin of a tick and its look at the bus other programs may run, and peers send."""
     bench = Bench()

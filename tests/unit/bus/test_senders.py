@@ -319,3 +319,41 @@ def test_a_flood_of_boot_ids_takes_no_memory_and_changes_nothing() -> None:
     assert bench.accused == {"boot": 2000}
     bench.ticks(200)
     assert len(bench.verifier._contents) <= 64
+
+
+def recording(bench: Bench, seconds: float, back_us: int = 8_000_000) -> int:
+    """Have messages of an earlier process heard; return by how much their sender's clock has gone back, as it seems."""
+    for seq in range(1, round(seconds / 0.02) + 1):
+        bench.clock.advance(TICK_US)
+        assert not bench.offer(REBORN, seq, -back_us)
+    return bench.verifier.gone_back_us(bench.clock.utc_us())
+
+
+def test_a_clock_that_was_set_back_between_two_processes_is_told_of_and_its_messages_stay_refused() -> None:
+    bench = Bench()
+    bench.ticks(50)
+    bench.leave()
+    bench.come()
+    assert recording(bench, 1.9) == 0, "messages of the process before may be on their way"
+    bench.clock.advance(100_000)
+    assert recording(bench, 0.1) > 0
+    assert bench.refusals.by_reason == {"replayed": 100}
+
+
+def test_a_recording_tells_of_no_clock_while_its_sender_is_heard_or_is_away() -> None:
+    bench = Bench()
+    for seq in range(1, 200):
+        bench.ticks(1)
+        assert not bench.offer(REBORN, seq, -30_000_000)
+        assert bench.verifier.gone_back_us(bench.clock.utc_us()) == 0
+    bench.leave()
+    assert recording(bench, 4.0, 30_000_000) == 0
+
+
+def test_one_message_of_an_earlier_process_tells_of_no_clock_however_often_it_is_repeated() -> None:
+    bench = Bench()
+    bench.ticks(50)
+    for _ in range(200):
+        bench.clock.advance(TICK_US)
+        assert not bench.offer(REBORN, 7, -30_000_000)
+    assert bench.verifier.gone_back_us(bench.clock.utc_us()) == 0
