@@ -21,6 +21,8 @@ _WINDOW_US = 5_000_000  # bounds of this window and of the one before are kept
 _DRIFT_US = 2_000  # two clocks drift apart by less in two windows: 200 ppm
 _UNKNOWN_US = 1 << 62
 _UNMEASURED_US = 1 << 61  # bounds beyond are none
+MOST_APART_US = 10_000_000  # that is allowed for; seals are held to it, too
+_TOO_FAR = "which is too far: nothing it says is believed"
 _ADVICE = "Set the clocks of the hosts (chrony, PTP)"
 _REPORTED_US = 50_000  # corrections that differ by more from the last one reported are
 
@@ -88,6 +90,7 @@ class PeerClocks:
         self._clocks = {agent: _PeerClock() for agent in peers}
         self._note, self._trusts_equal = note, trusts_equal
         self._refused_us: dict[int, int] = {}  # by peer: how far a refused message was ahead
+        self._behind: set[int] = set()  # peers whose messages are refused as too old
         self._gone_back_us: dict[int, int] = {}  # by peer: how far its clock has gone back, as refused messages show
         self.alert = ""
 
@@ -112,9 +115,17 @@ class PeerClocks:
             self._note("clock_gone_back", agent=agent, by_s=by_us / 1e6)
             self.alert = self._farthest_off()
 
+    def too_far_behind(self, agent: int) -> None:
+        """Take in that messages are refused because the stamps of the peer are too far behind to allow for."""
+        if agent not in self._behind:
+            self._behind.add(agent)
+            self.alert = self._farthest_off()
+
     def believed(self, agent: int) -> None:
         """Take in that a message of a peer was accepted."""
-        if self._gone_back_us.pop(agent, None) is not None:
+        if agent in self._behind or agent in self._gone_back_us:
+            self._behind.discard(agent)
+            self._gone_back_us.pop(agent, None)
             self.alert = self._farthest_off()
 
     def answered(self, agent: int, sent_utc_us: int, received_utc_us: int, utc_us: int) -> None:
@@ -148,6 +159,9 @@ class PeerClocks:
             self.alert = self._farthest_off()
 
     def _farthest_off(self) -> str:
+        if self._behind:
+            name, most_s = agent_name(min(self._behind)), MOST_APART_US // 1_000_000
+            return f"clock of {name} is more than {most_s} s behind this one, {_TOO_FAR}. {_ADVICE}"
         if self._gone_back_us:
             agent, by_us = max(self._gone_back_us.items(), key=lambda item: item[1])
             name = agent_name(agent)
@@ -157,7 +171,7 @@ class PeerClocks:
             )
         if self._refused_us:
             agent, ahead_us = max(self._refused_us.items(), key=lambda item: item[1])
-            return f"{_apart(agent, ahead_us)}, which is too far: nothing it says is believed. {_ADVICE}"
+            return f"{_apart(agent, ahead_us)}, {_TOO_FAR}. {_ADVICE}"
         agent, clock = max(self._clocks.items(), key=lambda item: abs(item[1].reported_us))
         if abs(clock.reported_us) <= _REPORTED_US:
             return ""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import StatusMessage, decode_status
-from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.peer_clocks import MOST_APART_US, PeerClocks
 from swarmctl.bus.peers import MAX_LEAD_US, peer_verifiers
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage
@@ -24,7 +24,6 @@ _COMPANY_US = 10_000_000  # a peer whose last status is older has left
 SILENT_US = 2_000_000  # ten statuses; who is heard within it has not ended, and its clock is measured
 _LAGS_TOLD = 8  # in one status, so that its size does not grow with the swarm: 50 peers are told in 1.4 s
 _READY_LEAD_US = 1_000_000  # largest lead of a peer's ready time over its status
-_CLOCK_LEAD_US = 10_000_000  # largest lead of a peer's clock over ours; seals are held to it, too
 _DESCENDS = frozenset((FlightMode.LAND, FlightMode.RTL))  # modes in which an autopilot does, or is about to
 _HOLDS = frozenset((FlightMode.HOLD,))
 _MOVES = frozenset(FlightMode) - _HOLDS
@@ -63,10 +62,12 @@ class PeerStatuses:
     ) -> None:
         self._agent, self._bus, self._note, self._refusals, self._clocks = agent, bus, note, refusals, clocks
         self._verifiers = peer_verifiers(peers, topics.STATUS, rate_hz, refusals, presence=presence)
+        self._numbers = {agent_name(agent): agent for agent in peers}
         self._ends = VouchedEnds(vouchers)
         self._excluded: set[int] = set()  # peers of which an operator has said that they have ended
         self._newest: dict[int, StatusMessage] = {}
         self._heard_us: dict[int, int] = {}  # UTC of the newest one's arrival
+        self._late_since_us: dict[int, int] = {}  # peers of which only statuses have come that are too old
         self._ended: frozenset[int] | None = frozenset()  # peers that have; None: to be found out anew
         self._lag_told = -1  # peer whose lag was told last
         self.uncommitted: frozenset[int] = frozenset()
@@ -97,6 +98,7 @@ class PeerStatuses:
                 self._clocks.gone_back(status.agent, back_us)
             return None
         self._clocks.believed(status.agent)
+        self._late_since_us.pop(status.agent, None)
         self._newest[status.agent], self._heard_us[status.agent], self._ended = status, utc_us, None
         if not status.uses_commitments:  # trajectory messages say more of the clocks of those that commit
             self._measure_clock(status, utc_us)
@@ -104,8 +106,17 @@ class PeerStatuses:
             self.uncommitted ^= {status.agent}
         return status
 
+    def take_late(self, sender: str, utc_us: int) -> None:
+        """Take in that the seal of a status is too old, as all are by a clock that is too far behind.
+
+        After it was cut off, messages of a peer that have waited come at once, before new ones: those tell nothing.
+        """
+        agent = self._numbers.get(sender)
+        if agent is not None and utc_us - self._late_since_us.setdefault(agent, utc_us) >= SILENT_US:
+            self._clocks.too_far_behind(agent)
+
     def _is_far_ahead(self, status: StatusMessage, utc_us: int) -> bool:
-        return status.utc_us - self._clocks.ahead_us(status.agent) > utc_us + _CLOCK_LEAD_US
+        return status.utc_us - self._clocks.ahead_us(status.agent) > utc_us + MOST_APART_US
 
     def _measure_clock(self, status: StatusMessage, utc_us: int) -> None:
         self._clocks.received(status.agent, status.utc_us, utc_us)

@@ -15,7 +15,7 @@ from swarmctl.bus.messages.path_messages import stamp_us
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import PeerPaths
-from swarmctl.bus.refusals import Refusals
+from swarmctl.bus.refusals import LATE, Refusals
 from swarmctl.bus.senders import Presence
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.collision.separation import (
@@ -117,6 +117,8 @@ class WorldModel:
         self._orders.refuse_misdated(utc_us)
         for sender, topic, reason in self._bus.refused():
             self.refusals.add(sender, topic, reason, utc_us)
+            if reason == LATE and topic == topics.STATUS.name:
+                self.statuses.take_late(sender, utc_us)
         self.refusals.report(utc_us)
         self._watch_unresponsive(utc_us)
         return [order for order in orders if order is not None]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -14,7 +16,7 @@ import pytest
 from swarmctl.agent.sensing.peer_statuses import PeerStatuses
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
-from swarmctl.bus.bus import agent_name
+from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.messages.json_messages import (
     MAX_OBSTACLES,
@@ -26,6 +28,7 @@ from swarmctl.bus.messages.json_messages import (
     first_list,
 )
 from swarmctl.bus.messages.path_messages import encode_path
+from swarmctl.bus.network.hosts import HostParams
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Presence
@@ -37,6 +40,7 @@ from swarmctl.core.operator_verbs import EXCLUDE, PEER
 from swarmctl.core.trajectory import resting
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from tests import builders
+from tests.benches.sealed_hub import SealedHub
 from tests.unit.bus.test_topics import STATUS
 
 BALL = Obstacle(center_ned_m=(5.0, 0.0, -2.0), radius_m=0.5, keep_out_m=1.0, visibility_m=100.0)
@@ -52,10 +56,11 @@ class Bench:
     events: list[dict[str, Any]] = field(default_factory=list)
     seq: int = 0
     quorum: int = 1
+    connect: Callable[[LocalHub, str], Bus] = LocalHub.connect
 
     def __post_init__(self) -> None:
         self.hub = LocalHub(self.clock.now_us)
-        self.bus = self.hub.connect(agent_name(0))
+        self.bus = self.connect(self.hub, agent_name(0))
         self.peer, self.operator = self.hub.connect(agent_name(1)), self.hub.connect(topics.OPERATOR)
         note = lambda name, **fields: self.events.append({"event": name, **fields})  # noqa: E731
         vouchers = {topics.OPERATOR: {0, 1, 2}, "bravo": {1}}
@@ -363,6 +368,57 @@ def test_what_an_ended_process_has_said_comes_again_beside_the_one_that_follows_
             bench.tick()
     assert bench.rejected["replayed"] == 20
     assert gone_back(bench) == []
+
+
+HOSTS = [
+    HostParams(name=name, address=f"127.0.0.1:{7000 + agent}", agents=(agent,)) for agent, name in enumerate("abc")
+]
+
+
+class SealedPeer:
+    """Agent 1 on another computer, whose clock is behind; agent 0 hears it at 5 Hz."""
+
+    def __init__(self, folder: Path) -> None:
+        sealed = SealedHub.of(HOSTS, folder)
+        self.bench = Bench(connect=lambda hub, name: sealed.connect(hub, name, None))
+        self.sealer = sealed.sealer("b", agent_name(1))
+
+    def speak(self, seconds: float, behind_us: int) -> str:
+        """Have it speak by such a clock; return the alert then."""
+        bench = self.bench
+        for _ in range(round(5 * seconds)):
+            bench.seq += 10
+            stamp_us = bench.clock.utc_us() - behind_us
+            said = msgspec.structs.replace(STATUS, agent=1, ticks=bench.seq, ready_utc_us=0, utc_us=stamp_us)
+            sent_us = bench.hub.now_us() - behind_us
+            bench.peer.publish(topics.STATUS, self.sealer.seal(topics.STATUS.stream, encode_message(said), sent_us))
+            for _ in range(10):
+                bench.tick()
+        return bench.world_model.clocks.alert
+
+
+def test_a_peer_whose_clock_is_too_far_behind_to_be_believed_is_told_of_until_it_is(tmp_path: Path) -> None:
+    """The seals of its messages are too old, as those of any recording. Who was cut off sends old ones for a moment."""
+    peer = SealedPeer(tmp_path)
+    peer.bench.clock.advance(60_000_000)
+    assert peer.speak(1.8, 15_000_000) == ""
+    alert = peer.speak(0.6, 15_000_000)
+    assert alert.startswith("clock of agent-1 is more than 10 s behind this one, which is too far"), alert
+    assert "Set the clocks of the hosts (chrony, PTP)" in alert
+    assert peer.bench.world_model.statuses.boot_id(1) is None
+    assert peer.bench.rejected == {"late": 12}
+    assert "too far" not in peer.speak(0.4, 0)
+    assert peer.bench.world_model.statuses.boot_id(1) == STATUS.boot_id
+
+
+def test_old_messages_beside_new_ones_tell_of_no_clock(tmp_path: Path) -> None:
+    peer = SealedPeer(tmp_path)
+    peer.bench.clock.advance(60_000_000)
+    for _ in range(20):
+        assert peer.speak(0.2, 15_000_000) == ""
+        assert peer.speak(0.2, 0) == ""
+    peer.bench.clock.advance(20_000_000)
+    assert peer.speak(0.2, 15_000_000) == "", "it was cut off, and this has waited"
 
 
 def test_a_status_that_comes_while_the_agent_is_held_up_says_nothing_of_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
