@@ -89,10 +89,13 @@ def test_who_has_landed_does_not_fail_because_it_waits_for_one_that_does_not(
     """As where a pilot keeps one of two vehicles in the air after Ctrl-C."""
     monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_LAND_S", 2.0)
     services = ScriptedServices(tmp_path, [IGNORES_SIGTERM, IGNORES_SIGTERM])
+    others = services.hub.connect("bravo", {ENDED: [OPERATOR]})
     services.phases, services.obeys, services.interrupts = {0: Phase.DONE}, False, 1
     problems = services.fly().problems
     assert len([problem for problem in problems if agent_name(1) in problem]) == 2
     assert not any(agent_name(0) in problem for problem in problems)
+    told = [decode_ended(payload) for _, payload in others.receive(ENDED)]
+    assert EndedMessage(agent=0, boot_id=1, is_down=True) in told, "agents of other computers hear nothing more of it"
 
 
 def test_an_agent_that_ends_between_two_looks_still_says_how_it_ended(tmp_path: Path) -> None:

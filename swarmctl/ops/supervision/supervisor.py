@@ -29,7 +29,7 @@ from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.supervision.own_pause import OwnPause
-from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery, handed_over
+from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery, handed_over, is_done
 from swarmctl.ops.supervision.standstill import Standstill
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
@@ -326,13 +326,7 @@ class FlightSupervisor:
         if any(_end_of(child) not in self._reported for child in self._agents() if child.poll() is not None):
             return False  # it has ended since the agents were watched, and may say how the flight went
         if self._land_ordered_s is not None and now_s > self._land_until_s:
-            for view in running:
-                child = self._services.children[agent_name(view.agent)]
-                if view.status is not None and view.status.phase == Phase.DONE:
-                    self._reported.add(_end_of(child))  # it only waits for who has not landed
-                elif not self._recovery.is_on(view.agent):
-                    self._fail("not_landed", f"{child.name} did not end in time and was killed")
-                kill_all([child])
+            self._end_late(running)
             return not running
         if not running:
             deaths_s = [
@@ -345,6 +339,20 @@ class FlightSupervisor:
             bus_is_suspect = len(running) == len(self._views) and len(running) > 1
             self._land(_LAND_S if bus_is_suspect else _AFTER_DEATH_S)
         return False
+
+    def _end_late(self, running: list[AgentView]) -> None:
+        """Kill who has not landed in time, and who is done and only waits for those."""
+        for view in running:
+            child = self._services.children[agent_name(view.agent)]
+            if view.status is not None and is_done(view.status):
+                self._reported.add(_end_of(child))
+                kill_all([child])
+                self._vouch_for_end(view, 128 + signal.SIGKILL)
+                self._recover(view, 128 + signal.SIGKILL)
+                continue
+            if not self._recovery.is_on(view.agent):
+                self._fail("not_landed", f"{child.name} did not end in time and was killed")
+            kill_all([child])
 
     def _note_end(self, view: AgentView, child: Child, code: int) -> None:
         view.note = "done" if code == EXIT_OK else f"exit {code}"
