@@ -42,6 +42,7 @@ class RunningLaunch(msgspec.Struct, frozen=True):
     version: str = ""  # of the swarmctl that flies
     ending: bool = False  # nobody answers any more; its report is still written
     utc_ahead_us: int | None = None  # of its clock over monotonic time, which is the same for all processes here
+    down: tuple[int, ...] = ()  # agents that have ended with their vehicles down, as a station heard of their hosts
 
     def utc_us(self) -> int:
         """Return UTC by the launch's clock, which follows steps of the computer's slowly [us]."""

@@ -183,6 +183,26 @@ def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: 
         assert least_separation_m(alpha.run_dir, bravo.run_dir) >= 0.85
 
 
+def test_who_has_landed_with_a_host_that_has_ended_does_not_fail_an_order_to_land_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody repeats any more that it has landed, and the station has heard it."""
+    path = write_swarm(tmp_path, duration_s=600.0)
+    make_keys(path, monkeypatch)
+    with started(path) as start:
+        alpha, bravo, station = start("alpha"), start("bravo"), start("station")
+        alpha.until_phase("TRACK", 1)
+        bravo.until_phase("TRACK", 1)
+        os.kill(bravo.pid_of("--id", "1"), signal.SIGKILL)
+        assert bravo.end() == 4, bravo.text()
+        held = station.verb("hold", "1")
+        assert held.returncode == 4
+        landed = station.verb("land")
+        assert (landed.returncode, "agent-0 accepts" in landed.stdout) == (0, True), landed.stderr
+        assert "agent-1: it has ended, its vehicle is on the ground" in landed.stdout
+        assert (alpha.end(), station.end()) == (130, 4), station.text()
+
+
 def test_a_station_ends_without_who_was_excluded_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_swarm(tmp_path, duration_s=6.0)
     make_keys(path, monkeypatch)

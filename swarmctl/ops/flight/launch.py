@@ -343,6 +343,12 @@ class Launcher(Services):
             self._announced = msgspec.structs.replace(told, utc_ahead_us=ahead_us)
             announce(self._announced)
 
+    def announce_down(self, agents: tuple[int, ...]) -> None:
+        """Publish who has ended with its vehicle down, as nobody may be left who says so to operators' commands."""
+        if self._announced is not None and agents != self._announced.down:
+            self._announced = msgspec.structs.replace(self._announced, down=agents)
+            announce(self._announced)
+
     def _announce_end(self) -> None:
         """Publish that nobody answers any more; that it can't be, without a descriptor left, stops no ending."""
         if self._announced is not None:

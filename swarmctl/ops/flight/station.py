@@ -78,6 +78,7 @@ def run_station(config: Config, options: LaunchOptions) -> int:
             while not (stop.count or watch.step()):
                 viewer.step()
                 services.announce_clock()
+                services.announce_down(watch.down)
                 if router.poll() is not None:
                     watch.problems.append(f"router {router.how_it_ended()}; see {router.log}. The swarm flies on")
                     break
@@ -168,6 +169,12 @@ class SwarmWatch:
             self._conclude(lost, ())
         return self.is_over
 
+    @property
+    def down(self) -> tuple[int, ...]:
+        """Return the agents that have ended and left their vehicles down, and whom no other process speaks for."""
+        now_s = self._clock_s()
+        return tuple(view.agent for view in self._views if self._is_down(view) and now_s - view.received_s > _GONE_S)
+
     def close(self) -> None:
         """Write what is still to be recorded; before it is over, judge by what is known, and say who has not ended."""
         if not self.is_over:
@@ -239,8 +246,11 @@ class SwarmWatch:
 
         That may arrive before the last status, which has the outcome.
         """
-        is_down = self._ends.is_down(view.agent, None if view.status is None else view.status.boot_id)
-        return (_is_done(view) or is_down) and now_s - view.received_s > _GONE_S
+        return (_is_done(view) or self._is_down(view)) and now_s - view.received_s > _GONE_S
+
+    def _is_down(self, view: AgentView) -> bool:
+        """Return whether the newest process of an agent has ended and left its vehicle down, as who runs it says."""
+        return self._ends.is_down(view.agent, None if view.status is None else view.status.boot_id)
 
     def _lost(self, now_s: float, silent_s: float) -> dict[int, str]:
         """Return who is silent for longer than `silent_s` and has not ended, in words; nobody before one has flown."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Collection, Iterator, Mapping, Set
 from contextlib import contextmanager
 
 import msgspec
@@ -88,10 +88,11 @@ class GoneAgents:
 
     Args:
         vouchers: agents of which each sender may say so.
+        known: of whom that was heard before; who said so may have ended too, and says nothing more.
     """
 
-    def __init__(self, vouchers: Mapping[str, Set[int]]) -> None:
-        self._ends = VouchedEnds(vouchers)
+    def __init__(self, vouchers: Mapping[str, Set[int]], known: Collection[int] = ()) -> None:
+        self._ends, self._known = VouchedEnds(vouchers), known
         self._heard: set[int] = set()
         self._began_us: int | None = None
         self._now_us = 0
@@ -111,7 +112,9 @@ class GoneAgents:
     def has(self, agent: int) -> bool:
         """Return whether an agent has ended, its vehicle is down, and no other process speaks for it."""
         listened_us = self._now_us - (self._now_us if self._began_us is None else self._began_us)
-        return agent not in self._heard and listened_us >= _UNHEARD_US and self._ends.is_down(agent, None)
+        if agent in self._heard or listened_us < _UNHEARD_US:
+            return False
+        return self._ends.is_down(agent, None) if self._ends.has_ended(agent, None) else agent in self._known
 
 
 def list_keepers(identity: OwnIdentity | None) -> tuple[str, ...]:
@@ -153,7 +156,7 @@ def read_agents(launch: RunningLaunch) -> tuple[dict[int, StatusMessage], frozen
     Raises:
         StartError: the launch is ending.
     """
-    agents, gone = range(launch.agents), GoneAgents(vouchers(launch))
+    agents, gone = range(launch.agents), GoneAgents(vouchers(launch), launch.down)
     with joined(launch) as bus:
         statuses = _statuses(bus, agents, ANSWER_S, gone)
     if len(statuses) < launch.agents:
@@ -163,7 +166,7 @@ def read_agents(launch: RunningLaunch) -> tuple[dict[int, StatusMessage], frozen
 
 def watch_statuses(launch: RunningLaunch, every_s: float) -> Iterator[dict[int, StatusMessage]]:
     """Yield the statuses that have arrived since the last time, by agent, until the launch ends."""
-    gone = GoneAgents(vouchers(launch))
+    gone = GoneAgents(vouchers(launch), launch.down)
     with joined(launch) as bus:
         while runs(launch):
             yield _statuses(bus, range(launch.agents), 0.0, gone)

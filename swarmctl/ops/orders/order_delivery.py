@@ -221,7 +221,8 @@ def deliver(
         StartError: the bus can't be joined, or the launch is ending and nobody is left to answer.
     """
     asked = addressed(launch, order, agents)
-    delivery = OrderDelivery(order, asked, len(asked) == launch.agents, GoneAgents(vouchers(launch)))
+    gone = GoneAgents(vouchers(launch), launch.down)
+    delivery = OrderDelivery(order, asked, len(asked) == launch.agents, gone)
     with joined(launch) as bus:
         began_s = repeated_s = time.monotonic()
         while delivery.open and time.monotonic() - began_s < ANSWER_S:

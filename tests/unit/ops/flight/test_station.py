@@ -310,6 +310,19 @@ def test_who_has_ended_on_the_ground_is_not_waited_for_and_is_named(watched: Wat
     assert watched.watch.problems == [f"agent-1 failed: it has ended, and its last phase heard is {heard}"]
 
 
+def test_whose_vehicle_is_down_is_told_to_operators_until_another_process_speaks_for_it(watched: Watched) -> None:
+    assert not watched.run(2.0, ALL_TRACK)
+    watched.end(1, is_down=True)
+    assert not watched.run(1.0, OTHERS_TRACK)
+    assert list(watched.watch.down) == [], "its last statuses may be on their way"
+    assert not watched.run(3.0, OTHERS_TRACK)
+    assert list(watched.watch.down) == [1]
+    assert not watched.run(0.4, ALL_TRACK, starts=2)
+    assert list(watched.watch.down) == []
+    assert not watched.run(10.0, OTHERS_TRACK)
+    assert list(watched.watch.down) == [], "of this process nobody has said that it has ended"
+
+
 def test_the_news_of_an_end_may_come_before_the_last_status(watched: Watched) -> None:
     assert not watched.run(2.0, ALL_TRACK)
     assert not watched.run(2.0, OTHERS_DONE)

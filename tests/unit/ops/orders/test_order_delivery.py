@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import pytest
@@ -29,7 +29,9 @@ LAUNCH = RunningLaunch("circle-1a", "unixsock-stream//x", 1, 0.0, 3, "runs/x")
 class Scene:
     """An operator, and agents with real filters of orders: some refuse, and those who are `lost` hear nothing."""
 
-    def __init__(self, verb: str, refusals: Mapping[int, str] | None = None, agents: int = 3) -> None:
+    def __init__(
+        self, verb: str, refusals: Mapping[int, str] | None = None, agents: int = 3, down: Collection[int] = ()
+    ) -> None:
         self.ended: dict[int, EndedMessage] = {}  # agents that publish nothing, as their supervisor says
         self.now_us = UTC_US
         self.hub = LocalHub(lambda: self.now_us)
@@ -38,10 +40,11 @@ class Scene:
         self.orders = [Orders(i, Refusals(lambda *_, **__: None)) for i in range(agents)]
         self.refusals = refusals or {}
         self.lost: set[int] = set()
+        self.silent: set[int] = set()  # agents that hear and publish nothing, and of which nothing is said
         self.obeyed: list[int] = []
         self.phases = [Phase.TRACK] * agents
         self.lands = True
-        gone = GoneAgents({"alpha": frozenset(range(agents))})
+        gone = GoneAgents({"alpha": frozenset(range(agents))}, down)
         self.supervisor = self.hub.connect("alpha")
         self.delivery = OrderDelivery(Order(verb), range(agents), everybody=True, gone=gone)
         self.sent = 0
@@ -54,9 +57,9 @@ class Scene:
             self.now_us += 100_000
             for i, bus in enumerate(self.agents):
                 for sender, payload in bus.receive(COMMAND):
-                    if i not in self.lost and i not in self.ended:
+                    if i not in self.lost | self.silent and i not in self.ended:
                         self.take(i, sender, payload)
-                if i not in self.ended:
+                if i not in self.ended and i not in self.silent:
                     self.publish(i)
             for end in self.ended.values():
                 self.supervisor.publish(ENDED, encode_message(end))
@@ -133,6 +136,23 @@ def test_who_has_ended_with_its_vehicle_down_is_not_waited_for_and_fails_no_land
         "problem": "",
         "comes_to": "it has ended, its vehicle is on the ground",
     }
+
+
+def test_who_was_known_to_have_ended_with_its_vehicle_down_fails_no_landing_unless_it_is_heard_otherwise() -> None:
+    """Its host has ended too, and says nothing more."""
+    scene = Scene("land", down=(1,))
+    scene.silent = {1}
+    scene.repeat(4)
+    assert scene.delivery.open == [1], "another process of it may not have been heard yet"
+    scene.repeat(6)
+    assert (scene.delivery.open, scene.problems) == ([], [])
+    scene.ended = {1: end_of(1, is_down=False)}
+    scene.repeat()
+    assert scene.delivery.open == [1]
+    spoken = Scene("land", down=(1,))
+    spoken.lost = {1}
+    spoken.repeat(10)
+    assert spoken.delivery.open == [1]
 
 
 def test_who_has_ended_can_not_hold() -> None:
