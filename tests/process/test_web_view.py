@@ -87,6 +87,29 @@ def test_a_live_view_is_shown_where_it_is_served_and_its_page_dies_with_the_comm
     assert not served.is_running() or served.status() == psutil.STATUS_ZOMBIE
 
 
+def test_two_that_are_begun_at_once_serve_two_pages(folder: Path) -> None:
+    """Each its own recording: a server whose data port is taken would send to the other one."""
+    command = [sys.executable, "-m", "swarmctl", "replay", str(folder), "--web"]
+    both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    try:
+        ports: list[int | None] = []
+        for process in both:
+            assert process.stdout is not None
+            shown = re.search(r"http://\S+", process.stdout.readline())
+            assert shown, "it has said where it is"
+            page = urlsplit(shown.group())
+            ports += [page.port, urlsplit(parse_qs(page.query)["url"][0]).port]
+            assert {port for _, port in listeners(process.pid)} == {*ports[-2:]}
+            with urllib.request.urlopen(shown.group(), timeout=20) as answer:
+                assert b"web viewer" in answer.read()
+        assert len({*ports}) == 4
+    finally:
+        for process in both:
+            process.send_signal(signal.SIGINT)
+        codes = [process.wait(20) for process in both]
+    assert codes == [0, 0]
+
+
 def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StartError, match="no such recording"), web_page(str(tmp_path / "telemetry.rrd")):
         pytest.fail("nothing is served")

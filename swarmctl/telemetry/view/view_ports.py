@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 HOST = "127.0.0.1"
 PORTS_TRIED = 50
@@ -11,12 +12,40 @@ PORTS_TRIED = 50
 
 def free_view_ports(first: int) -> Iterator[int]:
     """Yield the ports without a listener among the `PORTS_TRIED` from `first` on."""
-    for port in range(first, min(first + PORTS_TRIED, 65536)):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    return (port for port in _from(first) if _is_free(port))
+
+
+@contextmanager
+def held_view_port(first: int) -> Iterator[int]:
+    """Hold a port without a listener, from `first` on, that nobody else holds until the block ends; 0: there is none.
+
+    Who is to listen on it is another process, which binds it later: two that only look would both find the same port.
+    What is bound here is the UDP port of the same number. The system gives it to one process, and frees it however
+    that ends. It comes first, as looking binds the TCP port for a moment, in which its holder's server may want it.
+    """
+    for port in _from(first):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as claim:
             try:
-                probe.bind((HOST, port))
-                probe.listen(1)
+                claim.bind((HOST, port))
             except OSError:
                 continue
-        yield port
+            if not _is_free(port):
+                continue
+            yield port
+            return
+    yield 0
+
+
+def _from(first: int) -> range:
+    return range(first, min(first + PORTS_TRIED, 65536))
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+            probe.listen(1)
+        except OSError:
+            return False
+    return True

@@ -21,7 +21,7 @@ import psutil
 from swarmctl.errors import StartError
 from swarmctl.process_lifetime import PARENT_ENV, die_with_parent, module_command
 from swarmctl.telemetry.view.recordings import refuse_no_recording, viewer_binary
-from swarmctl.telemetry.view.view_ports import HOST, free_view_ports
+from swarmctl.telemetry.view.view_ports import HOST, held_view_port
 
 _FIRST_PAGE_PORT, _FIRST_DATA_PORT = 9090, 9976  # the live view has 9876 and those above it
 _BEGIN_S = 20.0  # longest time until it listens
@@ -46,11 +46,18 @@ def web_page(target: str, log: Path | None = None) -> Iterator[WebPage]:
         ConfigError: the file is no recording.
         StartError: there is no such recording, or no port is free, or the server does not start.
     """
-    is_live = "://" in target
     refuse_no_recording(target)
-    port, data_port = next(free_view_ports(_FIRST_PAGE_PORT), 0), next(free_view_ports(_FIRST_DATA_PORT), 0)
-    if not port or not data_port:
-        raise StartError(f"no free port from {_FIRST_PAGE_PORT} or {_FIRST_DATA_PORT} on for a page on {HOST}")
+    with held_view_port(_FIRST_PAGE_PORT) as port, held_view_port(_FIRST_DATA_PORT) as data_port:
+        if not port or not data_port:
+            raise StartError(f"no free port from {_FIRST_PAGE_PORT} or {_FIRST_DATA_PORT} on for a page on {HOST}")
+        with _serving(target, port, data_port, log) as page:
+            yield page
+
+
+@contextmanager
+def _serving(target: str, port: int, data_port: int, log: Path | None) -> Iterator[WebPage]:
+    """Serve a page on `port`, and a recording that it shows on `data_port`."""
+    is_live = "://" in target
     source = target if is_live else f"rerun+http://{HOST}:{data_port}/proxy"
     command = module_command(__name__, "--serve-web", "--bind", HOST, "--web-viewer-port", f"{port}")
     command += (target,) if is_live else ("--port", f"{data_port}", target)
