@@ -248,6 +248,34 @@ def test_the_stopping_row_includes_the_motion_of_the_peer() -> None:
     assert spaces.stop_offset_m[0] == pytest.approx(2.9)
 
 
+def stopping(guess: Array, others: Array) -> HalfSpaces:
+    """Return half-spaces of an agent at rest against a peer that moves."""
+    params = PARAMS.model_copy(update={"right_of_way_rad": 0.0})
+    peer = builders.keep_out(pos_ned_m=others)
+    spaces = half_spaces([peer], guess, np.zeros(2), np.zeros(2), dt_s=0.1, own_priority_id=0, params=params)
+    assert spaces is not None
+    return spaces
+
+
+def test_the_stopping_row_counts_what_the_peer_does_at_the_end_of_the_horizon() -> None:
+    """It turns away on its way: it comes at 1 m/s, and flies east past the agent then."""
+    turning = np.vstack([line((6.0, 0.0, 0.0), (5.5, 0.0, 0.0), 5), line((5.5, 0.3, 0.0), (5.5, 1.5, 0.0), 4)])
+    spaces = stopping(still((3.0, 1.5, 0.0)), turning)
+    np.testing.assert_allclose(spaces.normal[0, -1], [-1.0, 0.0])
+    assert spaces.stop_s[0] == pytest.approx(0.0), "it comes no closer any more"
+    assert spaces.stop_offset_m[0] == pytest.approx(-5.5 + 0.9)
+    back = stopping(still((3.0, 1.5, 0.0)), turning[::-1])
+    assert back.stop_offset_m[0] == pytest.approx(back.offset_m[0, -1]), "it leaves at the end"
+
+
+def test_a_keep_out_that_is_far_at_the_end_bounds_no_stop() -> None:
+    leaving, coming = line((2.0, 0.0, 0.0), (6.0, 0.0, 0.0)), line((6.0, 0.0, 0.0), (2.0, 0.0, 0.0))
+    spaces = stopping(still((0.0, 0.0, 0.0)), leaving)
+    assert np.isfinite(spaces.offset_m[0, 0]) and np.isneginf(spaces.stop_offset_m[0])
+    spaces = stopping(still((0.0, 0.0, 0.0)), coming)
+    assert np.isneginf(spaces.offset_m[0, 0]) and np.isfinite(spaces.stop_offset_m[0])
+
+
 # -- half-spaces in space ---------------------------------------------------------------------------------------------
 
 
