@@ -148,7 +148,7 @@ def test_a_number_that_is_not_finite_is_refused(number: int, bad: float) -> None
         changed(32, "<B", 4),
         changed(33, "<B", 41),  # header length
         changed(33, "<B", 0),
-        changed(32, "<H", 4 | 24 << 8),  # four points from within the header: the length would fit
+        changed(32, "<H", 4 | 30 << 8),  # four points from within the header: the length would fit
         encode_path(path(POINTS[:1])),
         encode_path(path(np.zeros((251, 3)))),
     ],

@@ -16,6 +16,8 @@ from swarmctl.bus.messages.path_messages import (
     MAX_POINTS,
     decode_path,
     encode_path,
+    longest_step_m,
+    stamp_us,
 )
 from swarmctl.core.types import MAX_MARGIN_M, Array, PredictedPath
 from tests import builders
@@ -141,8 +143,15 @@ def bent(by_m: float) -> Array:
 
 @pytest.mark.parametrize(
     "points",
-    [bent(126.0 * COARSEST_M), EAST + 2.0**14, EAST[:2], np.full((41, 3), np.nan)],
-    ids=["bends too much", "too far away", "two points", "not a number"],
+    [
+        bent(126.0 * COARSEST_M),
+        bent(-126.0 * COARSEST_M),
+        EAST + 2.0**14,
+        EAST - 2.0**14,
+        EAST[:2],
+        np.full((41, 3), np.nan),
+    ],
+    ids=["bends too much", "to the other side", "too far away", "too far south", "two points", "not a number"],
 )
 def test_what_can_not_be_compact_is_sent_as_float32(points: Array) -> None:
     assert encode_path(path(points), compact=True) == encode_path(path(points))
@@ -170,6 +179,7 @@ def changed(offset: int, code: str, value: int) -> bytes:
         changed(32, "<B", 40),  # points
         changed(32, "<B", 42),
         changed(33, "<B", 35),  # header length
+        changed(33, "<B", 41)[:-1],  # of which the body begins within the header, and has the right length
         changed(34, "<b", -17),  # exponent
         changed(34, "<b", -9),
         changed(34, "<b", 127),
@@ -178,6 +188,36 @@ def changed(offset: int, code: str, value: int) -> bytes:
 )
 def test_malformed_compact_paths_are_refused(payload: bytes) -> None:
     assert decode_path(payload) is None
+
+
+def test_a_longer_header_of_a_later_minor_version_is_skipped() -> None:
+    payload = changed(33, "<B", 45)
+    decoded = decode_path(payload[:42] + b"new" + payload[42:])
+    assert decoded is not None
+    np.testing.assert_array_equal(decoded.pos_ned_m, sent(CIRCLE).pos_ned_m)
+
+
+@pytest.mark.parametrize(("flags", "is_told"), [(0, False), (1, True), (2, False), (3, True), (254, False)])
+def test_flags_of_a_later_version_tell_of_no_acceleration(flags: int, is_told: bool) -> None:
+    """What is not told must not be read as a setpoint that asks for none: peers expect the vehicle elsewhere."""
+    decoded = decode_path(changed(3, "<B", flags))
+    assert decoded is not None
+    assert (decoded.setpoint_accel_ned_m_s2 is not None) is is_told
+
+
+def test_the_time_of_a_path_is_read_without_the_path() -> None:
+    """Paths of two topics are put into the order of their times before they are checked."""
+    payload = encode_path(path(CIRCLE), compact=True)
+    assert stamp_us(payload) == stamp_us(encode_path(path(CIRCLE))) == stamp_us(payload[:42]) == UTC_US
+    assert [stamp_us(payload[:size]) for size in (0, 1, 41)] == [0, 0, 0]
+
+
+def test_the_longest_step_is_how_far_a_vehicle_may_come_between_two_points() -> None:
+    """In space, whatever the other steps are; a path that is none goes nowhere."""
+    points = np.outer(np.arange(5), [0.25, 0.0, 0.0])
+    points[3:] += (0.5, -1.0, 0.25)  # one step of (0.75, -1, 0.25)
+    assert longest_step_m(encode_path(path(points))) == pytest.approx(np.linalg.norm((0.75, -1.0, 0.25)))
+    assert longest_step_m(encode_path(path(points))[:-1]) == 0.0
 
 
 @given(st.binary(min_size=24 + 117, max_size=24 + 117))
