@@ -31,6 +31,8 @@ from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START,
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child
 from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle
+from swarmctl.telemetry.recording.event_log import EventLog
+from swarmctl.telemetry.recording.file_names import events_file
 from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
 from swarmctl.telemetry.recording.run_files import read_events
 from tests.benches.scripted_services import FLIES_LONG, IGNORES_SIGTERM, LOADS_MODULES, ScriptedServices, ends
@@ -358,6 +360,31 @@ def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
     assert scene.fly().exit_code(violated=False) == EXIT_INTERRUPTED
     assert time.monotonic() - began_s < 10.0
     assert {child.poll() for child in scene.children.values()} == {137}
+
+
+@pytest.mark.parametrize("is_real", [True, False])
+def test_who_kills_the_agents_of_real_vehicles_is_told_which_parameters_they_keep(
+    tmp_path: Path, is_real: bool
+) -> None:
+    """Simulated ones are gone with their parameters; so is nothing of an agent that has ended, or has changed none."""
+    were = {"COM_OBL_RC_ACT": 0, "COM_OF_LOSS_T": 1.5}
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, ends(0), FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
+    for agent in (0, 1):
+        EventLog(tmp_path / events_file(agent_name(agent)), agent_name(agent)).write("parameters_changed", were=were)
+    EventLog(tmp_path / events_file(agent_name(2)), agent_name(2)).write("phase", phase="TRACK")
+    scene.obeys = False
+    scene.began_s, scene.act = 0.0, lambda: setattr(scene, "interrupts", 2)
+    while scene.children[agent_name(1)].poll() is None:
+        time.sleep(0.01)
+    vehicles = ", ".join(f'{{sysid = {i + 1}, url = "udpin://127.0.0.1:{14_541 + i}"}}' for i in range(3))
+    real = ("sitl.enabled=false", f"vehicles=[{vehicles}]")
+    problems = scene.fly(*(real if is_real else ())).problems
+    told = [text for text in problems if "parameters" in text]
+    assert [text.split(",")[0] for text in told] == (
+        ["vehicle 1 (agent-0) may keep the parameters of this flight"] if is_real else []
+    )
+    assert all('"COM_OBL_RC_ACT": 0' in text and '"COM_OF_LOSS_T": 1.5' in text for text in told)
+    assert scene.printed("ground station") is is_real
 
 
 class RouterSeen(CountedBus):

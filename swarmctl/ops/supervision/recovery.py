@@ -10,14 +10,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
+from swarmctl.bus.bus import agent_name
 from swarmctl.bus.messages.json_messages import StatusMessage
+from swarmctl.core.json_safe import to_json
 from swarmctl.core.types import FlightMode, Landed, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.processes import Child
 from swarmctl.ops.supervision.status_table import AgentView, name_of
+from swarmctl.telemetry.recording.changed_parameters import read_originals
 
 RECOVERY_S = 90.0  # a failsafe that returns home first needs most of it
+_SET_BACK = (
+    "Set them back with a ground station before another launch, which takes what it finds for what was; no verb does: "
+    "swarmctl check --apply sets what flights need"
+)
 _DOWN = (EXIT_OK, EXIT_INTERRUPTED)  # an agent ends with these only when it is done
 
 
@@ -83,6 +91,28 @@ class Recovery:
             status, _, _ = self._last_known(view)
             if status is not None and status.phase >= Phase.ARM and not (is_done(status) and _stands(status)):
                 self._lost.add(view.agent)
+
+    def kept_parameters(self, views: Sequence[AgentView], directory: Path) -> list[str]:
+        """Return one line for each vehicle whose agent was killed before it could set back what it has changed.
+
+        Args:
+            views: of the agents that were killed.
+            directory: the run folder, in which agents note what parameters were before they change them.
+        """
+        found = []
+        for view in views:
+            keeps = (
+                f"vehicle {self._sysids[view.agent]} ({agent_name(view.agent)}) may keep the parameters of this flight"
+            )
+            try:
+                were = read_originals(directory, agent_name(view.agent))
+            except (OSError, ValueError) as error:
+                if view.status is not None:  # else it may have changed none
+                    found.append(f"{keeps}, and what they were can't be read: {error}")
+                continue
+            if were:
+                found.append(f"{keeps}, which were {to_json(were)}. {_SET_BACK}")
+        return found
 
     def _last_known(self, view: AgentView) -> tuple[StatusMessage | None, float, bool]:
         """Return the newest status of who has heard the vehicle, its time, and whether it is of the ended agent."""

@@ -159,6 +159,8 @@ class FlightSupervisor:
         kill_all(list(self._services.children.values()))
         if not self._config.sitl.enabled:
             self._recovery.give_up(running)
+            for words in self._recovery.kept_parameters(running, self._services.context.directory):
+                self._fail("parameters_kept", words)
 
     def _report_left_vehicles(self) -> LaunchResult:
         """Report every vehicle that is not known to be on the ground."""
