@@ -174,3 +174,18 @@ def test_the_approach_is_slowed_as_the_barrier_says(
 
     slope = (after(1e-5) - after(-1e-5)) / 2e-5
     assert slope == pytest.approx(-PARAMS.gain_1_s * after(0.0), abs=0.02)
+
+
+@pytest.mark.parametrize(("down_m", "least_01", "most_01"), [(0.6, 0.05, 0.56), (-0.6, 0.45, 1.0)])
+def test_no_more_and_no_less_thrust_is_asked_for_than_the_airframe_has(
+    down_m: float, least_01: float, most_01: float
+) -> None:
+    """One below that comes up, and one above that comes down; hovering takes half of all thrust."""
+    model = VehicleModelParams(thrust_min_01=least_01, thrust_max_01=most_01)
+    here = builders.start(pos_ned_m=np.zeros(3), virtual_control=HOVER)
+    coming = (0.0, 0.0, -math.copysign(2.0, down_m))
+    other = Body(pos_ned_m=(0.0, 0.0, down_m), vel_ned_m_s=coming, apart_m=APART_M, responsibility_01=1.0)
+    found = Barrier(PARAMS, model, DT_S).filtered(HOVER, here, NO_WIND, 0.5, bodies=[other])
+    assert found is not None
+    lift = found[2] * math.sqrt(1.0 - found[:2] @ found[:2])
+    assert lift == pytest.approx((most_01 if down_m > 0.0 else least_01) * 2.0 * GRAVITY_M_S2, abs=1e-3)
