@@ -66,8 +66,11 @@ class LinePlanner:
     def stopping_candidate(self, committed: Trajectory, brake_us: int, utc_us: int) -> Trajectory:
         return committed
 
-    def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
+    def evasive_trajectory(self, committed: Trajectory, now: Situation, *, apart: bool = False) -> Trajectory | None:
         return None
+
+    def may_halt_later(self, committed: Trajectory, now: Situation) -> bool:
+        return False
 
     def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         return None

@@ -65,6 +65,7 @@ class Scope:
     interrupted: frozenset[int] = frozenset(range(AGENTS))  # agents that they may befall
     kinds: frozenset[str] = INTERRUPTIONS
     doubts: frozenset[int] = NOBODY  # agents that may doubt others at any time, and stop before them
+    leaves: frozenset[int] = NOBODY  # those of them that may leave their own places for that
 
 
 class Said(NamedTuple):
@@ -176,10 +177,12 @@ class Agent:
                 commitments.propose(_situation(reading, messages))
             yield self._read(before, commitments)
         if self._number in self._scope.doubts and known.keys() == self._peers:  # who is silent has been heard
-            commitments = self._commitments(before, "", doubts=True)
-            commitments.update(before.clock, messages, required)
-            commitments.stop_before(_situation(before.clock, messages), _SOMEBODY)
-            yield self._read(before, commitments)
+            for wanted in self._choices:
+                commitments = self._commitments(before, wanted, doubts=True)
+                commitments.update(before.clock, messages, required)
+                leaves = self._number in self._scope.leaves
+                commitments.stop_before(_situation(before.clock, messages), _SOMEBODY, leaves=leaves)
+                yield self._read(before, commitments)
 
     def _wishes(self, before: Process) -> Iterator[tuple[str, int]]:
         """Yield what may be wanted, and the clock's reading then; 0: nothing."""

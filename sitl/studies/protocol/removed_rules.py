@@ -137,7 +137,7 @@ _PAIR = Scope(world="pair", readings=_ONCE)
 _EXCLUDING = replace(_PAIR, suspects=frozenset({0}))
 _SPLIT = replace(_PAIR, suspects=frozenset({0, 1}))
 _RESTARTING = replace(_PAIR, interruptions=1, kinds=frozenset({RESTARTS}))
-_STOPPING = Scope(world="turns", readings=_ONCE, doubts=frozenset({0, 1}))
+_STOPPING = Scope(world="turns", readings=_ONCE, doubts=frozenset({0, 1}), leaves=frozenset({0}))
 REMOVED = (
     Removed(
         rule="only the newest message counts",
@@ -203,6 +203,11 @@ REMOVED = (
         rule="nor is about to commit to pass",
         rules=Rules(planner=StopsBesideProposals),
         scope=_STOPPING,
+    ),
+    Removed(
+        rule="only one of two leaves its places",
+        rules=Rules(),
+        scope=replace(_STOPPING, leaves=frozenset({0, 1})),
     ),
     Removed(
         rule="nor where others may exclude who has stopped",

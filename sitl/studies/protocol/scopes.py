@@ -18,6 +18,7 @@ SCOPES = {
         world="turns",
         readings=((1, 2), (1, 2), ()),
         doubts=frozenset({0, 1}),
+        leaves=frozenset({0}),
         interruptions=1,
         kinds=frozenset({RESTARTS}),
     ),

@@ -87,11 +87,18 @@ class SymbolicPlanner:
         """Return what is committed: nobody evades without keep-outs."""
         return committed
 
-    def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
-        """Find none."""
-        return None
+    def evasive_trajectory(self, committed: Trajectory, now: Situation, *, apart: bool = False) -> Trajectory | None:
+        """Find none but what is wanted, where that is apart from all places that others pass."""
+        return self._apart(self._wanted, now) if apart and self._wanted else None
+
+    def may_halt_later(self, committed: Trajectory, now: Situation) -> bool:
+        """Do not wait."""
+        return False
 
     def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """See `Planner`."""
-        halted = trajectory_of(at_any_time(places_of(committed)))
-        return None if halted is committed or self.conflicts(halted, now.utc_us, now.followed) else halted
+        return self._apart(places_of(committed), now)
+
+    def _apart(self, places: str, now: Situation) -> Trajectory | None:
+        found = trajectory_of(at_any_time(places))
+        return None if self.conflicts(found, now.utc_us, now.followed) else found

@@ -393,7 +393,7 @@ class Coordination:
         if doubted and most_are_heard(silent, near):
             self._commitments.evade_doubted(now, doubted)
         elif doubted and not self._membership.may_be_excluded:
-            self._commitments.stop_before(now, doubted)
+            self._commitments.stop_before(now, doubted, leaves=self._agent < min(self._peers))
 
 
 def _names(agents: Iterable[int]) -> str:

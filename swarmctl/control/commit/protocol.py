@@ -59,8 +59,9 @@ The proof rests on these assumptions, each of which is watched in flight:
   its own places (`stop_before`), if all of these are apart from all places of what the peer is known to have committed
   to or to propose, whenever it passes them. This needs no acknowledgement: what the peer commits to later it has
   proposed before, and this agent has acknowledged, so it is known; or the peer knows of the stop. If it stops likewise,
-  it does so within those places. With more than two it would not do: a majority that has never heard of the stop may
-  exclude the agent, and rely on its going on.
+  it does so within those places. The agent with the lower number may also leave its own places for others that are as
+  far apart from those of the peer: the peer does not leave its own. With more than two it would not do: a majority that
+  has never heard of the stop may exclude the agent, and rely on its going on.
 - Every agent takes part. A vehicle that does not (a pilot flies it, its agent has died) is a keep-out of the
   best-effort kind. A silent peer stays a participant; when one is left out is in `swarmctl.control.commit.membership`:
   it takes evidence or a majority. The events `membership` and `operator` say who was, and on whose word.
@@ -127,8 +128,14 @@ class Planner(Protocol):
     def stopping_candidate(self, committed: Trajectory, brake_us: int, utc_us: int) -> Trajectory:
         """Return the committed trajectory from `utc_us` on, left for straight braking at `brake_us`."""
 
-    def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
-        """Return a trajectory that keeps more distance to everything known than `committed`; None if none is found."""
+    def evasive_trajectory(self, committed: Trajectory, now: Situation, *, apart: bool = False) -> Trajectory | None:
+        """Return a trajectory that keeps more distance to everything known than `committed`; None if none is found.
+
+        With `apart` it passes no place that anybody known may pass, at whatever time.
+        """
+
+    def may_halt_later(self, committed: Trajectory, now: Situation) -> bool:
+        """Tell whether there is time to wait before a stop along the own places."""
 
     def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """Return `committed`, stopped along its own places, which others do not pass; None if that gains nothing."""
@@ -268,18 +275,22 @@ class Commitments:
             self._replace(evasive_trajectory)
             self.counts.evasive += 1
 
-    def stop_before(self, now: Situation, doubted: KeepOuts) -> None:
-        """Stop along the own places before vehicles whose agents are silent; see the proof.
+    def stop_before(self, now: Situation, doubted: KeepOuts, *, leaves: bool) -> None:
+        """Stop along the own places before vehicles whose agents are silent, or leave these; see the proof.
 
         Args:
             now: as for `evade`; its peers are all that may be flying as they have committed to.
             doubted: keep-outs of those vehicles.
+            leaves: whether the own places may be left where no stop is clear; of two agents one may.
         """
         flown, now = self.flown, replace(now, others=KeepOuts([*now.others, *doubted]))
-        if flown is None or self._planner.is_clear(flown, now):
+        if flown is None or self._planner.is_clear(flown, now) or self._planner.may_halt_later(flown, now):
             return
-        if (halting := self._planner.halting(flown, now)) is not None:
-            self._replace(halting)
+        found = self._planner.halting(flown, now)
+        if leaves and (found is None or not self._planner.is_clear(found, now)):
+            found = self._planner.evasive_trajectory(flown, now, apart=True) or found
+        if found is not None:
+            self._replace(found)
             self.counts.evasive += 1
 
     def _may_wait(self, flown: Trajectory, now: Situation) -> bool:

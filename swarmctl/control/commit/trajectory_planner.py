@@ -113,11 +113,12 @@ class TrajectoryPlanner:
             found = next((way for way in checked if way is not None), None)
         return found
 
-    def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
+    def evasive_trajectory(self, committed: Trajectory, now: Situation, *, apart: bool = False) -> Trajectory | None:
         """Return a trajectory that keeps more distance to everything known than `committed`; None when none is found.
 
         Candidates are the MPC's plan, a straight stop, and a climb over keep-outs that end at some height. One that
-        leaves the flight volume is taken only where none that stays in it is clear.
+        leaves the flight volume is taken only where none that stays in it is clear; with `apart`, none that passes a
+        place near one that anybody known may pass, at whatever time.
         """
         known = now.followed
 
@@ -127,6 +128,8 @@ class TrajectoryPlanner:
         least_m = margin_m(committed) + _MIN_GAIN_M
         best, best_order = None, (False, least_m)
         for candidate in self._evasive_candidates(committed, now):
+            if apart and not self._is_apart(candidate, now.utc_us, now):
+                continue
             found_m = margin_m(candidate)
             order = (found_m >= 0.0 and self._stays_in_volume(candidate, committed, now.utc_us), found_m)
             if found_m > least_m and order > best_order:
@@ -141,15 +144,17 @@ class TrajectoryPlanner:
         """Tell whether a trajectory comes too close to any of `known` between `utc_us` and when all are at rest."""
         return not self._margin_m(trajectory, utc_us, known, spare_m) >= 0.0
 
+    def may_halt_later(self, committed: Trajectory, now: Situation) -> bool:
+        """Tell whether a stop along the own places that begins `_HALT_DELAY_S` later is still clear of keep-outs."""
+        later = self._halting_candidates(committed, now, _HALT_DELAY_S)
+        return any(self._clearance_m(candidate, now) >= _UNSURE_M for candidate in later)
+
     def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """Return `committed`, stopped along its own places, which others do not pass; None if that gains nothing.
 
-        See `swarmctl.control.commit.halting`. While one that begins `_HALT_DELAY_S` later still is clear, it gains
-        nothing either. Otherwise the latest and softest is returned that is clear, or else the one with most distance.
+        See `swarmctl.control.commit.halting`. The latest and softest is returned that is clear, or else the one that
+        keeps most distance.
         """
-        later = self._halting_candidates(committed, now, _HALT_DELAY_S)
-        if any(self._clearance_m(candidate, now) >= _UNSURE_M for candidate in later):
-            return None
         best, best_m = None, self._clearance_m(committed, now) + _MIN_GAIN_M
         for after_s in _HALTS_AFTER_S:
             for candidate in self._halting_candidates(committed, now, after_s):
@@ -189,12 +194,16 @@ class TrajectoryPlanner:
 
     def _halting_candidates(self, committed: Trajectory, now: Situation, after_s: float) -> Iterator[Trajectory]:
         """Yield stops along the committed trajectory that begin so much later and need no acknowledgement."""
-        least_m = self._budget.committed_m + INTERPOLATION_MARGIN_M
-        begin_us, downwash = now.utc_us + round(1e6 * after_s), self._separation.downwash
+        begin_us = now.utc_us + round(1e6 * after_s)
         for brake_m_s2 in (self._params.brake_m_s2, self._hardest_m_s2):
             found = halted(committed, begin_us, now.utc_us, self.dt_us, brake_m_s2)
-            if found and places_apart_m(found, begin_us, now.followed, now.utc_us, downwash) >= least_m:
+            if found is not None and self._is_apart(found, begin_us, now):
                 yield found
+
+    def _is_apart(self, trajectory: Trajectory, begin_us: int, now: Situation) -> bool:
+        """Tell whether all places of a trajectory from a time on are apart from all that peers may pass from now on."""
+        apart_m = places_apart_m(trajectory, begin_us, now.followed, now.utc_us, self._separation.downwash)
+        return apart_m >= self._budget.committed_m + INTERPOLATION_MARGIN_M
 
     def _climbing_candidate(self, committed: Trajectory, begin_us: int, height_m: float) -> Trajectory:
         """Return the committed trajectory, left at `begin_us` for a climb by `height_m` over where it would stop."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
+from swarmctl.control.collision.separation import KeepOuts
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.halting import halted, places_apart_m
 from swarmctl.control.commit.protocol import Commitments
@@ -79,51 +79,78 @@ def at_goal(offsets_s: Array) -> tuple[Array, Array]:
 
 
 def before_a_vehicle(
-    met_m: float, peer: Trajectory | None, *, proposal: Trajectory | None = None, closest_m: float = 0.0
+    met: Array, peer: Trajectory, *, proposal: Trajectory | None = None, leaves: bool = False
 ) -> Commitments:
-    """Return an agent that flies north at 1.5 m/s, after it has been told that a silent peer's vehicle is met ahead."""
+    """Return an agent that flies north at 1.5 m/s, after it has been told where a silent peer's vehicle may be.
+
+    Args:
+        met: position of that vehicle at each step of 0.1 s, (K, 3), or (3,) for one that hovers.
+        peer: what its agent has committed to.
+        proposal: and what it has proposed.
+        leaves: whether the agent may leave its own places.
+    """
     agent = committing(0, max_keep_outs=2)
     agent.committed = straight((0.0, 0.0), 0.0)
     made = None if proposal is None else Proposal(number=1, made_utc_us=UTC_US, agent=1, trajectory=proposal)
-    peers = {} if peer is None else {1: builders.trajectory_message(agent=1, committed=peer, proposal=made)}
-    now = builders.situation(utc_us=UTC_US, begin_us=UTC_US, desired=DesiredReference(at_goal), peers=peers)
-    agent.stop_before(now, KeepOuts([met(met_m, agent, closest_m)]))
+    now = builders.situation(
+        utc_us=UTC_US,
+        begin_us=UTC_US,
+        desired=DesiredReference(at_goal),
+        peers={1: builders.trajectory_message(agent=1, committed=peer, proposal=made)},
+    )
+    where = met if met.ndim == 2 else np.tile(met, (agent.steps + 1, 1))
+    vehicle = builders.keep_out(
+        pos_ned_m=where[: agent.steps + 1], radius_m=HARD_MIN_M, hard_min_distance_m=HARD_MIN_M, priority_id=1
+    )
+    agent.stop_before(now, KeepOuts([vehicle]), leaves=leaves)
     return agent
 
 
-def met(x_m: float, agent: Commitments, y_m: float) -> KeepOut:
-    where = np.tile([x_m, y_m, -HEIGHT_M], (agent.steps + 1, 1))
-    return builders.keep_out(pos_ned_m=where, hard_min_distance_m=HARD_MIN_M, priority_id=1)
+def ahead(north_m: float, east_m: float = 0.0) -> Array:
+    return np.array([north_m, east_m, -HEIGHT_M])
 
 
 ELSEWHERE = straight((-5.0, 5.0), 90.0)
+COMES_M_S = 1.5
+COMES = ahead(5.0) - 0.1 * COMES_M_S * np.arange(200)[:, None] * np.array([1.0, 0.0, 0.0])  # along the own way
 
 
 def test_it_stops_before_the_vehicle_of_a_silent_peer() -> None:
-    agent = before_a_vehicle(2.2, ELSEWHERE)
+    agent = before_a_vehicle(ahead(2.2), ELSEWHERE)
     assert agent.counts.evasive == 1
     assert agent.committed is not None
     assert agent.committed.pos_ned_m[-1, 0] <= 2.2 - HARD_MIN_M
-    np.testing.assert_allclose(
-        agent.committed.pos_ned_m[:, 1:], np.tile([0.0, -HEIGHT_M], (len(agent.committed.pos_ned_m), 1))
-    )
+    off_m = agent.committed.pos_ned_m[:, 1:] - ahead(0.0)[1:]
+    assert np.abs(off_m).max() < 1e-6, "along its own places"
 
 
 def test_there_is_time_while_a_later_stop_is_clear() -> None:
-    assert before_a_vehicle(4.5, ELSEWHERE).counts.evasive == 0
-    assert before_a_vehicle(3.2, ELSEWHERE, closest_m=9.0).counts.evasive == 0, "nobody is met"
+    assert before_a_vehicle(ahead(4.5), ELSEWHERE).counts.evasive == 0
+    assert before_a_vehicle(ahead(2.2, 9.0), ELSEWHERE).counts.evasive == 0, "nobody is met"
 
 
+@pytest.mark.parametrize("leaves", [False, True])
 @pytest.mark.parametrize("is_proposal", [False, True], ids=["committed", "proposed"])
-def test_it_does_not_stop_where_the_peer_may_pass_later(is_proposal: bool) -> None:
+def test_it_does_not_stop_where_the_peer_may_pass_later(is_proposal: bool, leaves: bool) -> None:
     """It may be alive, and rely on this agent to be gone by then."""
-    crossing = straight((0.9, -7.0), 90.0, length=60)
-    if is_proposal:
-        assert before_a_vehicle(2.2, ELSEWHERE, proposal=crossing).counts.evasive == 0
-    else:
-        assert before_a_vehicle(2.2, crossing).counts.evasive == 0
+    crossing = straight((0.5, -7.0), 90.0, length=60)
+    peer, proposal = (ELSEWHERE, crossing) if is_proposal else (crossing, None)
+    assert before_a_vehicle(ahead(2.2), peer, proposal=proposal, leaves=leaves).counts.evasive == 0
+
+
+def test_of_two_one_leaves_its_places_before_a_vehicle_that_comes_along_them() -> None:
+    stops, leaves = (before_a_vehicle(COMES, ELSEWHERE, leaves=leaves) for leaves in (False, True))
+    assert closest_m(stops, COMES) < 0.48, "negative control: it flies into who stops"
+    assert closest_m(leaves, COMES) >= HARD_MIN_M
+
+
+def closest_m(agent: Commitments, vehicle: Array) -> float:
+    """Return the least distance of what an agent is committed to from a vehicle, at the same times."""
+    assert agent.committed is not None
+    own = agent.committed.sample(UTC_US + STEP_US * np.arange(len(vehicle)))[0]
+    return float(np.linalg.norm(own - vehicle, axis=1).min())
 
 
 def test_a_stop_that_would_not_gain_anything_is_not_made() -> None:
-    assert before_a_vehicle(0.3, ELSEWHERE, closest_m=0.3).counts.evasive == 0
-    assert SeparationParams().budget.committed_m > 0.3
+    assert before_a_vehicle(ahead(0.3, 0.3), ELSEWHERE).counts.evasive == 0
+    assert HARD_MIN_M > 0.5

@@ -37,7 +37,7 @@ def test_two_agents_that_meet_and_a_third_that_only_answers_are_explored_complet
         ("one interrupted", 6, 4829),
         ("all excluded", 3, 1146),
         ("all interrupted", 5, 4680),
-        ("two stop", 5, 31184),
+        ("two stop", 5, 44242),
     ],
 )
 def test_no_two_commitments_conflict(scope: str, depth: int, states: int) -> None:
