@@ -6,13 +6,16 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.agent.planning.separation_policy import Guaranteed
+from swarmctl.control.collision.separation import KeepOuts
 from swarmctl.control.commit.membership import Membership
-from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
+from swarmctl.control.commit.protocol import Commitments
+from swarmctl.control.commit.situation import Situation
 from tests.closed_loop.conftest import Flight, fly_now, mission_t_s
 
 PASSED_S = 4.4
 SWAP = ("agent.rate_hz=25", "sitl.start=air", "separation.mode=guaranteed", "mission.kind=swap")
 TWO = (*SWAP, "swarm.agents=2", "start.positions_ned_m=[[-2.9475,0.1762,-3],[3.0374,-0.2306,-3]]")
+HEAD_ON = (*SWAP, "swarm.agents=2", "start.positions_ned_m=[[2.5862,1.5048,-3],[-2.6043,-1.5153,-3]]")
 FOUR = (
     *(*SWAP, "swarm.agents=4"),
     "start.positions_ned_m=[[-2.3554,-1.9327,-3],[1.8384,-2.3011,-3],[2.3737,1.8975,-3],[-1.8638,2.3367,-3]]",
@@ -39,8 +42,20 @@ def evasions(running: Lockstep) -> int:
 @pytest.mark.usefixtures("configured_starts")
 def test_one_of_two_stops_before_the_vehicle_of_the_other(monkeypatch: pytest.MonkeyPatch, at_s: float) -> None:
     assert frozen(TWO, {1}, at_s).separation_m() >= 0.85
-    monkeypatch.setattr(TrajectoryPlanner, "halting", lambda *_: None)
+    monkeypatch.setattr(Commitments, "stop_before", lambda *_, **__: None)
     assert frozen(TWO, {1}, at_s).separation_m() < 0.48, "negative control: bodies touch"
+
+
+@pytest.mark.usefixtures("configured_starts")
+def test_one_of_two_leaves_its_places_where_the_other_flies_at_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert frozen(HEAD_ON, {1}, 1.0).separation_m() >= 0.85
+    stop_before = Commitments.stop_before
+
+    def only_stops(self: Commitments, now: Situation, doubted: KeepOuts, *, leaves: bool) -> None:
+        stop_before(self, now, doubted, leaves=False)
+
+    monkeypatch.setattr(Commitments, "stop_before", only_stops)
+    assert frozen(HEAD_ON, {1}, 1.0).separation_m() < 0.48, "negative control: by stops alone bodies touch"
 
 
 @pytest.mark.usefixtures("configured_starts")
