@@ -108,6 +108,24 @@ def test_who_is_committed_to_cross_keeps_clear_of_an_arducopter_whose_agent_free
     assert here.witness.min_separation_m() > BODIES_M
 
 
+@pytest.mark.parametrize("crossing_s", [0.4, 0.8, 1.2])
+def test_one_of_two_keeps_clear_of_an_arducopter_that_flies_at_it_without_its_agent(
+    field: Fielder, crossing_s: float
+) -> None:
+    here = booted(field, 2)
+    swap = ("mission.kind=swap", "mission.swap.travel_s=6", "start.positions_ned_m=[[2.99,0.1,-3],[-2.99,-0.1,-3]]")
+    sets = ("separation.mode=guaranteed", *swap)
+    command = (THREE_ARDUCOPTERS, *TWO_ARDUCOPTERS, *(f"--set={each}" for each in sets))
+    launched = here.launch(*command, "--duration", "20")
+    launched.until_phase("TRACK", 2)
+    time.sleep(crossing_s)
+    os.kill(launched.pid_of("agent", "--id", "1"), signal.SIGSTOP)
+    assert launched.end(END_S) == EXIT_MISSION, launched.text()
+    here.witness.wait(here.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
+    print(f"frozen {tracked_s(launched, 1):.2f} s after the begin: {here.witness.min_separation_m():.2f} m at least")
+    assert here.witness.min_separation_m() > BODIES_M
+
+
 @pytest.mark.parametrize("kind", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
 def test_two_that_hear_nobody_any_more_stop_where_they_do_not_meet(field: Fielder, kind: Kind) -> None:
     """They come at each other, and would meet if they stopped as transits do, at half of `accel_m_s2`."""
