@@ -200,17 +200,17 @@ REMOVED = (
         scope=_STOPPING,
     ),
     Removed(
-        rule="nor is about to commit to pass",
+        rule="stop unasked only where nobody is about to commit to pass",
         rules=Rules(planner=StopsBesideProposals),
         scope=_STOPPING,
     ),
     Removed(
-        rule="only one of two leaves its places",
+        rule="only one of two leaves its places unasked",
         rules=Rules(),
         scope=replace(_STOPPING, leaves=frozenset({0, 1})),
     ),
     Removed(
-        rule="nor where others may exclude who has stopped",
+        rule="stop unasked only where nobody may exclude who has stopped",
         rules=Rules(),
         scope=replace(_STOPPING, suspects=frozenset({0})),
     ),

@@ -16,8 +16,8 @@ from swarmctl.core.types import Array
 
 _LEAST_M_S = 0.05  # a slower motion has nearly stopped
 _LOOK_AHEAD_S = 1.0  # over which the speed is looked up that has to be lost
-_APART_M = 0.1  # between two of the places that are compared, at most
-_LONGEST_US = 100_000  # between them in time, at most
+_APART_M = 0.1  # at most, between neighbouring places of a trajectory that are compared with those of others
+_LONGEST_US = 100_000  # at most, between the times at which it passes them
 
 
 def halted(committed: Trajectory, begin_us: int, from_us: int, dt_us: int, brake_m_s2: float) -> Trajectory | None:

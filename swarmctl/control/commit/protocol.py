@@ -254,9 +254,7 @@ class Commitments:
         flown = self.flown
         if flown is None or not now.others or self._planner.is_clear(flown, now) or self._may_wait(flown, now):
             return
-        if (evasive_trajectory := self._planner.evasive_trajectory(flown, now)) is not None:
-            self._replace(evasive_trajectory)
-            self.counts.evasive += 1
+        self._change_to(self._planner.evasive_trajectory(flown, now))
 
     def evade_doubted(self, now: Situation, doubted: KeepOuts) -> None:
         """Evade vehicles whose agents are silent, which may as well fly as they have committed to.
@@ -270,10 +268,9 @@ class Commitments:
         flown, now = self.flown, replace(now, others=KeepOuts([*now.others, *doubted]))
         if flown is None or self._planner.is_clear(flown, now) or self._may_wait(flown, now):
             return
-        evasive_trajectory = self._planner.evasive_trajectory(flown, now)
-        if evasive_trajectory is not None and not self._planner.conflicts(evasive_trajectory, now.utc_us, now.followed):
-            self._replace(evasive_trajectory)
-            self.counts.evasive += 1
+        found = self._planner.evasive_trajectory(flown, now)
+        if found is not None and not self._planner.conflicts(found, now.utc_us, now.followed):
+            self._change_to(found)
 
     def stop_before(self, now: Situation, doubted: KeepOuts, *, leaves: bool) -> None:
         """Stop along the own places before vehicles whose agents are silent, or leave these; see the proof.
@@ -289,6 +286,10 @@ class Commitments:
         found = self._planner.halting(flown, now)
         if leaves and (found is None or not self._planner.is_clear(found, now)):
             found = self._planner.evasive_trajectory(flown, now, apart=True) or found
+        self._change_to(found)
+
+    def _change_to(self, found: Trajectory | None) -> None:
+        """Replace the committed trajectory without acknowledgement, and count that; None: nothing was found."""
         if found is not None:
             self._replace(found)
             self.counts.evasive += 1
