@@ -10,7 +10,7 @@ from typing import Any
 from swarmctl.agent.setup import AgentParams
 from swarmctl.agent.sharing.path_sharing import PathSharingParams
 from swarmctl.bus.network.hosts import HostParams
-from swarmctl.configuration.sections import LimitParams, SitlParams, VehicleParams
+from swarmctl.configuration.sections import LimitParams, SitlParams, StartParams, SwarmParams, VehicleParams
 from swarmctl.control.collision.barrier import BarrierParams
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
 from swarmctl.control.controllers.discovery import ControllerParams
@@ -153,6 +153,15 @@ def volume_problems(
         yield f"volume.corners_ne_m: {beyond} are outside of geofence.corners_ne_m; move the corners or the fence"
 
 
+def start_problems(start: StartParams, agents: int) -> Iterator[str]:
+    """Yield why start positions are not known."""
+    listed = len(start.positions_ned_m)
+    if listed and listed < agents:
+        yield f"start.positions_ned_m: {listed} positions for swarm.agents = {agents}; list one for each agent"
+    if not listed and not any(start.direction_ned):
+        yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
+
+
 def starts_apart(
     starts_ned_m: Sequence[tuple[float, float, float]], separation: SeparationParams, sitl: SitlParams
 ) -> Iterator[str]:
@@ -272,6 +281,24 @@ def address_problems(tree: Mapping[str, Any]) -> Iterator[str]:
     urls = mavlink.get("forward") if isinstance(mavlink, dict) else None
     if isinstance(urls, list) and all(isinstance(url, str) for url in urls):
         yield from forward_problems(urls)
+
+
+def shared_process_problems(swarm: SwarmParams, sitl: SitlParams) -> Iterator[str]:
+    """Yield that real vehicles would share a process."""
+    if swarm.agents_per_process > 1 and not sitl.enabled:
+        yield (
+            f"swarm.agents_per_process = {swarm.agents_per_process}: allowed: 1 without the built-in simulator; "
+            "one agent's failure must not be that of other real vehicles"
+        )
+
+
+def simulated_speed_problems(sitl: SitlParams) -> Iterator[str]:
+    """Yield that vehicles would fly by another time than agents."""
+    if sitl.speed != 1.0:
+        yield (
+            f"sitl.speed = {sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
+            "real time: swarmctl simulate, or python -m sitl --speed with clients of your own"
+        )
 
 
 def simulated_host_problems(hosts: Sequence[HostParams]) -> Iterator[str]:

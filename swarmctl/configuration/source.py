@@ -73,9 +73,10 @@ def set_value(tree: dict[str, Any], key: str, value: Any) -> list[str]:
         return [f"{shown(key)}: write it as key.sub"]
     if len(parts) > _MAX_DEPTH:
         return [f"{name}: {len(parts)} sections inside each other; allowed: {_MAX_DEPTH}"]
-    if wrong := _place(tree, parts, value):
-        return [f"{name}: {wrong}"]
-    return list(shape_problems({key: value}))
+    if problems := list(shape_problems({key: value})):
+        return problems
+    wrong = _place(tree, parts, value)
+    return [f"{name}: {wrong}"] if wrong else []
 
 
 def _place(tree: dict[str, Any], parts: list[str], value: Any) -> str:
