@@ -128,6 +128,15 @@ class PeerClocks:
             self._gone_back_us.pop(agent, None)
             self.alert = self._farthest_off()
 
+    def ended(self, agent: int) -> None:
+        """Take in that a process has ended: the clock of a peer needs no setting any more, unless it is heard again."""
+        self._refused_us.pop(agent, None)
+        self._behind.discard(agent)
+        self._gone_back_us.pop(agent, None)
+        if agent in self._clocks:
+            self._clocks[agent].reported_us = 0
+            self.alert = self._farthest_off()
+
     def answered(self, agent: int, sent_utc_us: int, received_utc_us: int, utc_us: int) -> None:
         """Take in when a peer, by its clock, received the own message stamped `sent_utc_us`."""
         self._narrow(agent, -_UNKNOWN_US, received_utc_us - sent_utc_us, utc_us)

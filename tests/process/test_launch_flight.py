@@ -387,6 +387,24 @@ def test_who_kills_the_agents_of_real_vehicles_is_told_which_parameters_they_kee
     assert scene.printed("ground station") is is_real
 
 
+@pytest.mark.parametrize("is_real", [True, False])
+def test_who_can_not_recover_a_real_vehicle_tells_which_parameters_it_keeps(tmp_path: Path, is_real: bool) -> None:
+    """It said that the vehicle is left, and the next launch would have taken its parameters for what they were."""
+    scene = ScriptedServices(tmp_path, [ends(1), ends(1)], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
+    for agent in (0, 1):
+        log = EventLog(tmp_path / events_file(agent_name(agent)), agent_name(agent))
+        log.write("parameters_changed", were={"COM_OF_LOSS_T": 1.5})
+    scene.lands = ends(1)
+    vehicles = ", ".join(f'{{sysid = {i + 1}, url = "udpin://127.0.0.1:{14_541 + i}"}}' for i in range(2))
+    real = ("sitl.enabled=false", f"vehicles=[{vehicles}]")
+    problems = scene.fly(*(real if is_real else ())).problems
+    assert any("vehicle 1 (agent-0) may be armed or in the air" in text for text in problems)
+    told = [text for text in problems if "parameters" in text]
+    assert [text.split(" may")[0] for text in told] == (
+        ["vehicle 1 (agent-0)", "vehicle 2 (agent-1)"] if is_real else []
+    )
+
+
 class RouterSeen(CountedBus):
     """Notes whether the router ran when an end was told."""
 

@@ -141,6 +141,7 @@ class PeerStatuses:
             self._refusals.add(sender, topics.ENDED.name, refusal, utc_us)
         if ended is not None:
             self._ended = None
+            self._clocks.ended(ended.agent)
             self._note("peer_ended", agent=ended.agent, boot_id=ended.boot_id, is_down=ended.is_down)
 
     def exclude(self, agent: int) -> None:
@@ -148,6 +149,7 @@ class PeerStatuses:
         self._ends.vouch(agent, self.boot_id(agent))
         self._excluded.add(agent)
         self._ended = None
+        self._clocks.ended(agent)
 
     def heard_us(self, agent: int) -> int:
         """Return the UTC at which the newest status of a peer has arrived; 0 without one."""

@@ -42,6 +42,7 @@ class Recovery:
         self._begun_s: dict[int, float] = {}
         self._before: dict[int, tuple[StatusMessage, float]] = {}  # what was heard last of an ended agent, and when
         self._lost: set[int] = set()  # agents whose vehicles are not known to be down, and are not watched any more
+        self._killed: set[int] = set()  # agents that were killed, wherever their vehicles were
 
     def is_on(self, agent: int) -> bool:
         """Return whether the newest agent of this vehicle only lands it."""
@@ -88,19 +89,24 @@ class Recovery:
     def give_up(self, views: Sequence[AgentView]) -> None:
         """Count every vehicle whose agent is killed before it was down as lost; so who was to be landed and was not."""
         for view in views:
+            self._killed.add(view.agent)
             status, _, _ = self._last_known(view)
             if status is not None and status.phase >= Phase.ARM and not (is_done(status) and _stands(status)):
                 self._lost.add(view.agent)
 
     def kept_parameters(self, views: Sequence[AgentView], directory: Path) -> list[str]:
-        """Return one line for each vehicle whose agent was killed before it could set back what it has changed.
+        """Return one line for each vehicle that is left, or whose agent was killed, with what its parameters were.
+
+        Agents set back what they have changed once a vehicle is down.
 
         Args:
-            views: of the agents that were killed.
+            views: of all agents.
             directory: the run folder, in which agents note what parameters were before they change them.
         """
         found = []
         for view in views:
+            if view.agent not in self._lost | self._killed:
+                continue
             keeps = (
                 f"vehicle {self._sysids[view.agent]} ({agent_name(view.agent)}) may keep the parameters of this flight"
             )

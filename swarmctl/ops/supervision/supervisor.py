@@ -159,14 +159,15 @@ class FlightSupervisor:
         kill_all(list(self._services.children.values()))
         if not self._config.sitl.enabled:
             self._recovery.give_up(running)
-            for words in self._recovery.kept_parameters(running, self._services.context.directory):
-                self._fail("parameters_kept", words)
 
     def _report_left_vehicles(self) -> LaunchResult:
-        """Report every vehicle that is not known to be on the ground."""
+        """Report every vehicle that is not known to be on the ground, and the parameters that were not set back."""
         self._result.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
         for words in self._result.left:
             self._fail("vehicle_left", words)
+        if not self._config.sitl.enabled:
+            for words in self._recovery.kept_parameters(self._views, self._services.context.directory):
+                self._fail("parameters_kept", words)
         return self._result
 
     def _receive(self) -> None:

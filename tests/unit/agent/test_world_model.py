@@ -352,6 +352,18 @@ def test_a_clock_that_has_gone_back_is_told_of_until_its_peer_is_believed() -> N
     assert "gone back" not in bench.world_model.clocks.alert
 
 
+@pytest.mark.parametrize("by", ["operator", "supervisor"])
+def test_a_clock_that_has_gone_back_is_not_told_of_once_its_peer_has_ended(by: str) -> None:
+    """Who was switched off for it stayed the alert of everybody else."""
+    bench = restarted(8_000_000, 4.0)
+    if by == "operator":
+        bench.world_model.statuses.exclude(1)
+    else:
+        bench.hub.carry("bravo", topics.ENDED, encode_message(EndedMessage(agent=1, boot_id=60, is_down=True)))
+        bench.tick()
+    assert bench.world_model.clocks.alert == ""
+
+
 def test_a_restart_by_a_clock_that_has_not_gone_back_tells_nothing_of_it() -> None:
     bench = restarted(0, 4.0)
     assert bench.world_model.statuses.boot_id(1) == 60

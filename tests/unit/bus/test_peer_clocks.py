@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -139,6 +140,36 @@ def test_a_clock_that_is_too_far_ahead_is_told_with_how_far_until_it_is_believed
     assert clocks.alert.startswith("clock of agent-2 is 11.00 s ahead of this one")
     clocks.received(2, 101_000_000, 101_000_000)
     assert clocks.alert == ""
+
+
+@pytest.mark.parametrize(
+    "off",
+    [
+        lambda clocks: clocks.refused(1, UTC_US + 11_000_000, UTC_US),
+        lambda clocks: clocks.gone_back(1, 2_000_000),
+        lambda clocks: clocks.too_far_behind(1),
+        lambda clocks: measured(clocks, UTC_US),
+    ],
+    ids=["too far ahead", "gone back", "too far behind", "allowed for"],
+)
+def test_the_clock_of_a_peer_that_has_ended_is_told_again_only_when_the_peer_is_heard_again(
+    off: Callable[[PeerClocks], None],
+) -> None:
+    clocks = PeerClocks([1], lambda *_, **__: None)
+    off(clocks)
+    told = clocks.alert
+    assert told.startswith("clock of agent-1 ")
+    clocks.ended(0)  # the own agent, as who runs it says when it is started again
+    assert clocks.alert == told
+    clocks.ended(1)
+    assert clocks.alert == ""
+    off(clocks)
+    assert clocks.alert == told
+
+
+def measured(clocks: PeerClocks, utc_us: int) -> None:
+    clocks.received(1, utc_us + 200_000, utc_us)
+    clocks.answered(1, utc_us, utc_us + 200_000, utc_us)
 
 
 def test_of_several_clocks_that_are_off_the_farthest_is_told() -> None:
