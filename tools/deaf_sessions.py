@@ -16,9 +16,10 @@ import tempfile
 import time
 from collections.abc import Sequence
 
-import swarmctl.bus.zenoh_bus as zenoh_bus
+import swarmctl.bus.zenoh_client as zenoh_client
 from swarmctl.bus.topics import COMMAND, STATUS
-from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
+from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.bus.zenoh_client import SCHEME
 from swarmctl.errors import StartError
 from tests.benches.router_process import start_router
 
@@ -53,7 +54,7 @@ def who_hears(talker: ZenohBus, listeners: Sequence[ZenohBus]) -> tuple[list[boo
 def main() -> None:
     """Restart the router, and print how many are deaf each time."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
-    parser.add_argument("--open-timeout-ms", type=int, default=zenoh_bus._CLIENT_OPEN_TIMEOUT_MS)
+    parser.add_argument("--open-timeout-ms", type=int, default=zenoh_client._CLIENT_OPEN_TIMEOUT_MS)
     parser.add_argument("--clients", type=int, default=12)
     parser.add_argument("--restarts", type=int, default=5)
     options = parser.parse_args()
@@ -61,7 +62,7 @@ def main() -> None:
     router = start_router(endpoint)
     names = [f"listener-{number}" for number in range(options.clients)]
     talker = ZenohBus(endpoint, "run", "talker", {COMMAND: names}, deaf_s=NEVER_S)
-    zenoh_bus._CLIENT_OPEN_TIMEOUT_MS = options.open_timeout_ms
+    zenoh_client._CLIENT_OPEN_TIMEOUT_MS = options.open_timeout_ms
     listeners = [joined(endpoint, name) for name in names]
     for restart in range(options.restarts):
         router.kill()

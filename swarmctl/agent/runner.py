@@ -29,7 +29,8 @@ from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.relay import RelayingBus
 from swarmctl.bus.silence import SessionWatch
 from swarmctl.bus.traffic import CountedBus
-from swarmctl.bus.zenoh_bus import NO_BUS, socket_file
+from swarmctl.bus.zenoh_client import NO_BUS, socket_file
+from swarmctl.bus.zenoh_session import ZenohSession
 from swarmctl.config import Config, load, own_identity
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.operator_verbs import Order
@@ -168,8 +169,19 @@ def note_priority(flights: Sequence[RealTimeAgent]) -> None:
 
 
 @contextmanager
-def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> Iterator[RealTimeAgent]:
+def flying_agent(
+    process: AgentProcess,
+    clock: WallClock,
+    stop: StopRequest,
+    opens_bus: Callable[..., ZenohSession] = ZenohSession,
+) -> Iterator[RealTimeAgent]:
     """Open the link, the bus and the recorder of one agent, and close them at the end.
+
+    Args:
+        process: what it is told.
+        clock: time of this host.
+        stop: a request to land.
+        opens_bus: opens the session of its bus.
 
     Raises:
         StartError: link, bus or vehicle can't be reached.
@@ -189,7 +201,7 @@ def flying_agent(process: AgentProcess, clock: WallClock, stop: StopRequest) -> 
         opened.callback(transport.close)
         recorder = Recorder(process.run_dir, agent)
         opened.callback(recorder.close)
-        link = CountedBus(_join(process, config, clock))
+        link = CountedBus(_join(process, config, clock, opens_bus))
         opened.callback(link.close)
         sink = SharedEvents(recorder, link, agent) if config.hosts else recorder
         flown = make_agent(
@@ -272,7 +284,7 @@ def _open_vehicle(
     return open_transport(url, process.fd, vehicle.is_vehicle, remote, greeting=vehicle.greeting)
 
 
-def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
+def _join(process: AgentProcess, config: Config, clock: WallClock, opens: Callable[..., ZenohSession]) -> Bus:
     """Connect to the bus of the run, or to an empty local one when there is no router."""
     me = agent_name(process.agent)
     if process.bus == NO_BUS:
@@ -304,6 +316,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
         utc_us=clock.utc_us,
         lease_ms=config.bus.lease_ms,
         carrier=lambda bus: RelayingBus(bus, others),
+        opens=opens,
     )
 
 

@@ -1,8 +1,9 @@
 """Several agents in one process, whose ticks take turns: for simulated swarms that outnumber the processors.
 
 An interpreter that ticks one agent after another finds its code in the caches of the processor, which one that sleeps
-between the ticks of a single agent does not. Each agent keeps its own link, session of the bus, recorder and deadlines;
-what they share is the thread that ticks them, and the process that they end with if it is killed.
+between the ticks of a single agent does not. Each agent keeps its own link, recorder and deadlines; what they share is
+the thread that ticks them, the session of the bus, by which what comes from other processes comes once for all of them,
+and the process that they end with if it is killed.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from swarmctl.agent.runner import (
     note_priority,
 )
 from swarmctl.bus.bus import agent_name
+from swarmctl.bus.zenoh_session import SharedSession
 from swarmctl.config import load
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import ConfigError, SwarmError
@@ -72,7 +74,7 @@ class Turns:
     """
 
     def __init__(self, clock: WallClock, tell: Callable[[AgentEnd], None]) -> None:
-        self._clock, self._tell = clock, tell
+        self._clock, self._tell, self._session = clock, tell, SharedSession()
         self._flights: dict[int, RealTimeAgent] = {}  # by agent
         self._open: dict[int, ExitStack] = {}
         self._closing: list[threading.Thread] = []
@@ -84,7 +86,7 @@ class Turns:
         self._open[agent] = stack
 
         def enter() -> None:
-            self._flights[agent] = stack.enter_context(flying_agent(process, self._clock, stop))
+            self._flights[agent] = stack.enter_context(flying_agent(process, self._clock, stop, self._session))
 
         self._take_turn(agent, enter)
 
@@ -111,6 +113,7 @@ class Turns:
         """Wait until everything is closed; returns the largest exit code."""
         for thread in self._closing:
             thread.join()
+        self._session.close()
         return max(self._codes, default=0)
 
     def _take_turn(self, agent: int, step: _Step) -> None:

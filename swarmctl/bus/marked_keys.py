@@ -51,13 +51,13 @@ class Inbox:
         session: of Zenoh.
         key: to receive.
         ring: newest samples kept.
+        hears_own: also what the same session publishes.
     """
 
-    def __init__(self, session: Any, key: str, ring: int) -> None:
+    def __init__(self, session: Any, key: str, ring: int, *, hears_own: bool) -> None:
         self._mark, self._ring = _mark_of(key), ring
-        self._subscriber = session.declare_subscriber(
-            key, zenoh.handlers.RingChannel(ring), allowed_origin=zenoh.Locality.REMOTE
-        )
+        origin = zenoh.Locality.ANY if hears_own else zenoh.Locality.REMOTE
+        self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(ring), allowed_origin=origin)
 
     def take(self) -> tuple[Sequence[Any], int]:
         """Return the payloads that have come, and how many messages were of other keys."""

@@ -17,7 +17,8 @@ import pytest
 from swarmctl.bus.marked_keys import MarkedPublisher
 from swarmctl.bus.refusals import HARMLESS, MISDELIVERED, RefusedMessage
 from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, STATUS, TICK, TOO_LONG
-from swarmctl.bus.zenoh_bus import COMMON_SETTINGS, SCHEME, ZenohBus, close_session, open_session
+from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.bus.zenoh_client import COMMON_SETTINGS, SCHEME, close_session, open_session
 from swarmctl.errors import EXIT_START, EXIT_USAGE, StartError
 from tests.benches.router_process import start_router
 

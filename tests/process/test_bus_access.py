@@ -25,7 +25,8 @@ from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.bus.network.router import run_router
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.topics import COMMAND, ENDED, EVENT, MISSION, OBSTACLES, PATH, STATUS, Topic
-from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
+from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.bus.zenoh_client import SCHEME
 from swarmctl.errors import StartError
 from tests.benches.free_ports import free_ports
 from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
@@ -247,7 +248,7 @@ def test_routers_pass_no_message_on_that_came_under_the_key_of_another_one(
 
         say_until_heard(b"first")
         with monkeypatch.context() as confused:
-            confused.setattr(mouth._now.publishers[PATH], "_mark", b"of another")
+            confused.setattr(mouth._session._now.publishers["agent-0"][PATH], "_mark", b"of another")
             for _ in range(5):
                 mouth.publish(PATH, b"confused")
         say_until_heard(b"last")

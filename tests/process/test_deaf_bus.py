@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import zenoh
 
-import swarmctl.bus.zenoh_bus as zenoh_bus
+import swarmctl.bus.zenoh_client as zenoh_client
 from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.identities import make_identities
 from swarmctl.bus.network.identity_files import STATION
@@ -37,7 +37,7 @@ ROUTER_GIVES_UP_MS = 10_000  # accept_timeout of Zenoh
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder = tmp_path_factory.mktemp("bus")
     folder.chmod(0o700)
-    endpoint = f"{zenoh_bus.SCHEME}{folder}/bus.sock"
+    endpoint = f"{zenoh_client.SCHEME}{folder}/bus.sock"
     router = start_router(endpoint)
     yield endpoint
     end(router)
@@ -68,10 +68,10 @@ def hears(listener: Bus, talker: Bus, seconds: float) -> bool:
 
 def deafen(bus: ZenohBus) -> None:
     """Take the ears of its session away; it goes on to send, and its token stays."""
-    for subscribers in bus._now.subscribers.values():
+    for subscribers in bus._session._now.inboxes.values():
         for subscriber in subscribers.values():
             subscriber.undeclare()
-    bus._now.tokens.undeclare()
+    bus._session._now.tokens.undeclare()
 
 
 def test_a_deaf_session_is_replaced(endpoint: str) -> None:
@@ -130,7 +130,7 @@ def test_it_is_replaced_at_once_if_asked_for(endpoint: str) -> None:
 
 def test_nobody_is_asked_where_there_is_no_router(endpoint: str) -> None:
     with pair(endpoint, deaf_s=1e9) as (listener, _):
-        listener._socket = Path("/nowhere/bus.sock")
+        listener._session._socket = Path("/nowhere/bus.sock")
         assert not listener.reopen()
         listener.close()
         assert not listener.reopen()
@@ -178,7 +178,7 @@ def test_no_client_gives_up_the_opening_of_a_session_before_its_router_does(monk
         asked.append(settings)
         raise zenoh.ZError("refused")
 
-    monkeypatch.setattr(zenoh_bus, "open_session", refuse)
+    monkeypatch.setattr(zenoh_client, "open_session", refuse)
     with pytest.raises(StartError):
-        ZenohBus(f"{zenoh_bus.SCHEME}/nowhere/bus.sock", "run", "agent-0", {})
+        ZenohBus(f"{zenoh_client.SCHEME}/nowhere/bus.sock", "run", "agent-0", {})
     assert asked[0]["transport/unicast/open_timeout"] > ROUTER_GIVES_UP_MS

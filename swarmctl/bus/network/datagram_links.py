@@ -25,7 +25,7 @@ from swarmctl.bus.network.datagram_routes import BEAT_S, Address, DatagramRoutes
 from swarmctl.bus.network.roster import OwnIdentity, split_address
 from swarmctl.bus.network.seals import PairKeys
 from swarmctl.bus.topics import TOPICS
-from swarmctl.bus.zenoh_bus import CLOSE_DEADLINE_S, close_within
+from swarmctl.bus.zenoh_client import CLOSE_DEADLINE_S, close_within
 from swarmctl.errors import StartError
 
 _PREFIX = "swarm/"

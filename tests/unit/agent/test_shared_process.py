@@ -102,7 +102,7 @@ class Scene:
             self.clock.advance(t_us - self.clock.now_us())
 
     @contextmanager
-    def _flying(self, process: AgentProcess, clock: Any, stop: Any) -> Iterator[Flight]:
+    def _flying(self, process: AgentProcess, *_: object) -> Iterator[Flight]:
         if process.agent in self.refused:
             raise self.refused[process.agent]
         yield self.flights[process.agent]
