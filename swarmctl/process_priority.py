@@ -31,6 +31,13 @@ def request_realtime(pid: int | None = None) -> bool:
         return False
 
 
+def leave_realtime() -> None:
+    """Schedule all threads of this process at normal priority again."""
+    with contextlib.suppress(OSError):
+        for task in Path("/proc/self/task").iterdir():
+            os.sched_setscheduler(int(task.name), os.SCHED_OTHER, os.sched_param(0))
+
+
 def request_realtime_for_this_thread(priority: int = FLIGHT_PRIORITY) -> bool:
     """Schedule the calling thread alone before all of normal priority; return False where that is not permitted.
 

@@ -12,7 +12,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
+from swarmctl.agent.flight_priority import FlightPriority
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.local.hub import LocalHub
@@ -45,7 +46,6 @@ from swarmctl.mavlink.signing.refusals import in_words
 from swarmctl.mavlink.signing.stamp_file import kept_channel
 from swarmctl.mavlink.transport import Transport, open_transport, parse_url, resolve
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.process_priority import request_realtime
 from swarmctl.signing_keys import read_own_key
 from swarmctl.telemetry.recording.recorder import Recorder
 from swarmctl.telemetry.recording.shared_events import SharedEvents
@@ -138,18 +138,19 @@ def run_agent(process: AgentProcess) -> int:
     clock = WallClock()
     with flying_agent(process, clock, stop) as flight:
         keep_from_collections()
+        priority = FlightPriority(clock, flight.note)
         if process.realtime:
-            note_priority([flight])
-        ending = _fly(flight, clock)
+            priority.ask()
+        ending = _fly(flight, clock, priority)
     if ending.words:
         print(ending.words, file=sys.stderr)
     return ending.exit_code
 
 
-def _fly(flight: RealTimeAgent, clock: WallClock) -> Ending:
+def _fly(flight: RealTimeAgent, clock: WallClock, priority: FlightPriority) -> Ending:
     flight.begin_at(clock.now_us())
     while True:
-        clock.sleep_until(flight.due_us)
+        priority.sleep_until(flight.due_us)
         ending = flight.step()
         if ending is not None:
             return ending
@@ -159,13 +160,6 @@ def keep_from_collections() -> None:
     """Keep objects of the start-up out of garbage collections during flight."""
     gc.collect()
     gc.freeze()
-
-
-def note_priority(flights: Sequence[RealTimeAgent]) -> None:
-    """Ask for real-time priority for this process, and record in every agent whether it was granted."""
-    granted, spent_s = request_realtime(), time.process_time()
-    for flight in flights:
-        flight.note("realtime", granted=granted, start_up_s=round(spent_s, 3))
 
 
 @contextmanager

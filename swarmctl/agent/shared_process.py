@@ -15,15 +15,16 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
+from typing import Any
 
 from swarmctl.agent.agent_end import AgentEnd, write_end
+from swarmctl.agent.flight_priority import FlightPriority
 from swarmctl.agent.runner import (
     AgentProcess,
     Ending,
     RealTimeAgent,
     flying_agent,
     keep_from_collections,
-    note_priority,
 )
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.zenoh_session import SharedSession
@@ -79,6 +80,7 @@ class Turns:
         self._open: dict[int, ExitStack] = {}
         self._closing: list[threading.Thread] = []
         self._codes: list[int] = []
+        self._priority = FlightPriority(clock, self._note)
 
     def open(self, process: AgentProcess, stop: StopRequest) -> None:
         """Open what an agent needs; its failure ends it before it has begun."""
@@ -94,7 +96,7 @@ class Turns:
         """Spread the first ticks of the agents over one period, after asking for priority if that is wanted."""
         keep_from_collections()
         if realtime:
-            note_priority(list(self._flights.values()))
+            self._priority.ask()
         now_us = self._clock.now_us()
         for place, flight in enumerate(self._flights.values()):
             flight.begin_at(now_us + place * flight.period_us // len(self._flights))
@@ -105,7 +107,7 @@ class Turns:
             return False
         agent = min(self._flights, key=lambda number: self._flights[number].due_us)
         flight = self._flights[agent]
-        self._clock.sleep_until(flight.due_us)
+        self._priority.sleep_until(flight.due_us)
         self._take_turn(agent, flight.step)
         return True
 
@@ -115,6 +117,11 @@ class Turns:
             thread.join()
         self._session.close()
         return max(self._codes, default=0)
+
+    def _note(self, name: str, **fields: Any) -> None:
+        """Record an event of every agent."""
+        for flight in self._flights.values():
+            flight.note(name, **fields)
 
     def _take_turn(self, agent: int, step: _Step) -> None:
         """Let an agent act; if it has ended, or fails, it takes no more turns."""

@@ -73,10 +73,15 @@ def run_name(name: str) -> str:
 
 
 def wants_realtime(config: Config, agents: Sequence[int]) -> bool:
-    """Return whether these agents are to have real-time priority and leave the processors some time for others."""
+    """Return whether these agents are to have real-time priority and leave the processors some time for others.
+
+    A process of several may have a processor for itself: it gives the priority up where it would leave nothing.
+    """
     if sys.platform != "linux":
         return False
-    return config.agent.realtime and len(agents) <= _AGENTS_PER_PROCESSOR * _processors()
+    processes, processors = len(_shares(len(agents), config.swarm.agents_per_process)), _processors()
+    is_little = len(agents) <= _AGENTS_PER_PROCESSOR * processors or processes <= processors
+    return config.agent.realtime and is_little
 
 
 def _processors() -> int:

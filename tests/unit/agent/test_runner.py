@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from swarmctl.agent.flight_priority import FlightPriority
 from swarmctl.agent.runner import (
     NOTHING_REFUSED,
     AgentProcess,
@@ -194,7 +195,7 @@ def test_who_has_landed_may_be_switched_off_while_its_agent_waits_for_peers(has_
         flight = RealTimeAgent(
             agent, load(None), paced, stop, sessions, note=print, vehicle="udpin://x", only_land=False
         )
-        return _fly(flight, paced).exit_code
+        return _fly(flight, paced, FlightPriority(paced, print)).exit_code
 
     if has_landed:
         assert fly() == EXIT_OK

@@ -201,7 +201,7 @@ def test_agents_of_real_vehicles_do_not_take_turns(tmp_path: Path) -> None:
 
 def test_priority_is_asked_for_once_and_noted_by_every_agent(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     answers = [True]
-    monkeypatch.setattr("swarmctl.agent.runner.request_realtime", answers.pop)
+    monkeypatch.setattr("swarmctl.agent.flight_priority.request_realtime", answers.pop)
     flights = [scene.add(agent, ticks=1) for agent in range(3)]
     scene.turns.begin(realtime=True)
     assert answers == []

@@ -19,6 +19,8 @@ from swarmctl.ops.processes import Child, Command, RunContext, agent_commands, c
         (2, ("swarm.agents=4",), True),
         (2, ("swarm.agents=5",), False),  # they could leave nothing for a shell
         (1, ("swarm.agents=2",), True),
+        (2, ("swarm.agents=20", "swarm.agents_per_process=10"), True),  # each has a processor, or gives the priority up
+        (2, ("swarm.agents=20", "swarm.agents_per_process=9"), False),
         (8, ("swarm.agents=3", "agent.realtime=false"), False),
     ],
 )

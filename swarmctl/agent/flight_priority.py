@@ -1,0 +1,65 @@
+"""The real-time priority of a process of agents: asked for before it flies, given up where it leaves others no time.
+
+Between its ticks such a process sleeps. One that hardly does computes more than its processor can, and with that
+priority nobody else would get any: neither shells, nor the launcher that could land its vehicles.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from swarmctl.process_priority import leave_realtime, request_realtime
+
+_WINDOW_US = 2_000_000
+_LEAST_SPARE_01 = 0.1
+
+
+class PacingClock(Protocol):
+    """Operations that are needed of the clock of this host."""
+
+    def now_us(self) -> int:
+        """Return the monotonic time."""
+
+    def sleep_until(self, t_us: int) -> None:
+        """Wait until a monotonic time."""
+
+
+class FlightPriority:
+    """Asks for the priority, and paces the ticks of the process.
+
+    Args:
+        clock: time of this host.
+        note: records an event of every agent of the process, given its name and fields.
+    """
+
+    def __init__(self, clock: PacingClock, note: Callable[..., None]) -> None:
+        self._clock, self._note = clock, note
+        self._is_realtime = False
+        self._since_us = self._slept_us = 0
+
+    def ask(self) -> None:
+        """Ask for real-time priority for this process, and record whether it was granted."""
+        self._is_realtime, spent_s = request_realtime(), time.process_time()
+        self._since_us, self._slept_us = self._clock.now_us(), 0
+        self._note("realtime", granted=self._is_realtime, start_up_s=round(spent_s, 3))
+
+    def sleep_until(self, due_us: int) -> None:
+        """Wait until a monotonic time; give the priority up if little time was left for that."""
+        began_us = self._clock.now_us()
+        self._clock.sleep_until(due_us)
+        if self._is_realtime:
+            self._look_at(self._clock.now_us(), began_us)
+
+    def _look_at(self, now_us: int, slept_since_us: int) -> None:
+        self._slept_us += now_us - slept_since_us
+        passed_us = now_us - self._since_us
+        if passed_us < _WINDOW_US:
+            return
+        spare_01 = self._slept_us / passed_us
+        self._since_us, self._slept_us = now_us, 0
+        if spare_01 < _LEAST_SPARE_01:
+            self._is_realtime = False
+            leave_realtime()
+            self._note("realtime", granted=False, spare_01=round(spare_01, 3))
