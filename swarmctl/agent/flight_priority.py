@@ -12,7 +12,8 @@ from typing import Protocol
 
 from swarmctl.process_priority import leave_realtime, request_realtime
 
-_WINDOW_US = 2_000_000
+_LOOK_US = 500_000  # a process that was paused, and so did not sleep, does so in one look
+_LOOKS = 4
 _LEAST_SPARE_01 = 0.1
 
 
@@ -37,7 +38,7 @@ class FlightPriority:
     def __init__(self, clock: PacingClock, note: Callable[..., None]) -> None:
         self._clock, self._note = clock, note
         self._is_realtime = False
-        self._since_us = self._slept_us = 0
+        self._since_us = self._slept_us = self._busy_looks = 0
 
     def ask(self) -> None:
         """Ask for real-time priority for this process, and record whether it was granted."""
@@ -46,7 +47,7 @@ class FlightPriority:
         self._note("realtime", granted=self._is_realtime, start_up_s=round(spent_s, 3))
 
     def sleep_until(self, due_us: int) -> None:
-        """Wait until a monotonic time; give the priority up if little time was left for that."""
+        """Wait until a monotonic time; give the priority up if little time has been left for that for two seconds."""
         began_us = self._clock.now_us()
         self._clock.sleep_until(due_us)
         if self._is_realtime:
@@ -55,11 +56,12 @@ class FlightPriority:
     def _look_at(self, now_us: int, slept_since_us: int) -> None:
         self._slept_us += now_us - slept_since_us
         passed_us = now_us - self._since_us
-        if passed_us < _WINDOW_US:
+        if passed_us < _LOOK_US:
             return
         spare_01 = self._slept_us / passed_us
         self._since_us, self._slept_us = now_us, 0
-        if spare_01 < _LEAST_SPARE_01:
+        self._busy_looks = self._busy_looks + 1 if spare_01 < _LEAST_SPARE_01 else 0
+        if self._busy_looks == _LOOKS:
             self._is_realtime = False
             leave_realtime()
             self._note("realtime", granted=False, spare_01=round(spare_01, 3))

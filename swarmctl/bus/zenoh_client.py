@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,11 @@ def is_blocked() -> bool:
 
 def close_within(session: Any, deadline_s: float) -> None:
     """Close a session; give up after the deadline, since a link without its other end can block."""
-    closer = threading.Thread(target=close_session, args=(session,), name=f"{THREADS}close", daemon=True)
-    closer.start()
-    closer.join(deadline_s)
+    run_within(partial(close_session, session), deadline_s)
+
+
+def run_within(leave: Callable[[], None], deadline_s: float) -> None:
+    """Do what may have to wait for the other end of a link; go on without it after the deadline."""
+    leaving = threading.Thread(target=leave, name=f"{THREADS}close", daemon=True)
+    leaving.start()
+    leaving.join(deadline_s)

@@ -30,6 +30,7 @@ from swarmctl.bus.zenoh_client import (
     close_session,
     close_within,
     open_client,
+    run_within,
     socket_file,
 )
 from swarmctl.errors import StartError
@@ -139,7 +140,7 @@ class ZenohSession:
                 return
             self._senders = {name: own for name, own in self._senders.items() if name != me}
         if self._senders or self._is_shared:
-            self._declare()
+            run_within(self._declare, CLOSE_DEADLINE_S)
         else:
             self.close()
 
@@ -244,7 +245,8 @@ class ZenohSession:
                     for topic in TOPICS
                 }
                 declared.own_tokens[name] = declared.session.liveliness().declare_token(self._key(name, _TOKEN))
-            return [*(declared.own_tokens.pop(name) for name in left), *unused]
+            tokens = [declared.own_tokens.pop(name, None) for name in left]
+            return [*(token for token in tokens if token is not None), *unused]
 
     def _declare_inboxes(self, declared: _Declared, topic: Topic) -> list[Inbox]:
         """Declare the inboxes of a topic that a session lacks, and return those that it has no use for."""

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from swarmctl.bus.bus import Bus
+from swarmctl.bus.network.identities import make_identities
+from swarmctl.bus.network.identity_files import STATION
+from swarmctl.bus.network.joining import join_bus
+from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, STATUS
 from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.zenoh_client import SCHEME
-from swarmctl.bus.zenoh_session import SharedSession
+from swarmctl.bus.zenoh_client import CLOSE_DEADLINE_S, SCHEME
+from swarmctl.bus.zenoh_session import SharedSession, ZenohSession
+from tests.benches.free_ports import free_ports
 from tests.benches.router_process import start_router
+from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
 from tests.process.test_bus import end, endpoint, until  # noqa: F401  (a fixture)
 from tests.process.test_deaf_bus import deafen
 
@@ -123,6 +133,28 @@ def test_who_leaves_is_gone_for_all_and_the_others_go_on(swarm: Swarm) -> None:
     assert until(lambda: swarm.operator.alive() == {"agent-2", OPERATOR})
 
 
+def test_who_leaves_waits_for_no_router_that_hangs() -> None:
+    where = f"{SCHEME}{tempfile.mkdtemp(prefix='swarm-test-')}/bus.sock"
+    router = start_router(where)
+    swarm = Swarm(where)
+    assert until(lambda: swarm.paths() == [set(OTHERS[i]) for i in range(3)])
+    left, stays = swarm.together
+    router.send_signal(signal.SIGSTOP)
+    for _ in range(2000):  # until the link takes nothing more
+        stays.publish(STATUS, bytes(20_000))
+    began_s = time.monotonic()
+    left.close()
+    assert time.monotonic() - began_s < CLOSE_DEADLINE_S + 2.0
+    for _ in range(100):
+        stays.publish(PATH, b"1")
+        assert stays.receive(PATH) is not None
+    assert time.monotonic() - began_s < CLOSE_DEADLINE_S + 4.0
+    router.send_signal(signal.SIGCONT)
+    assert until(lambda: swarm.operator.alive() == {"agent-1", "agent-2", OPERATOR})
+    swarm.close()
+    end(router)
+
+
 def test_a_deaf_session_of_several_is_replaced_though_they_hear_each_other(endpoint: str) -> None:  # noqa: F811
     swarm = Swarm(endpoint, deaf_s=1.0)
     everybody = [set(OTHERS[i]) for i in range(3)]
@@ -159,6 +191,46 @@ def test_who_left_while_another_session_was_opened_does_not_come_back_with_it(
     assert until(lambda: stays.receive(PATH) is not None and stays.reopened() == 1)
     assert until(lambda: swarm.operator.alive() == {"agent-1", "agent-2", OPERATOR})
     assert until(lambda: swarm.paths()[1:] == [{"agent-2"}, {"agent-1"}])
+
+
+def test_sealed_senders_of_one_session_believe_each_other_and_are_believed(tmp_path: Path) -> None:
+    make_identities(tmp_path, {"alpha": LOOPBACK, "bravo": LOOPBACK, "charlie": LOOPBACK, STATION: None})
+    one_each = SwarmOfHosts.of(tmp_path, free_ports(3))
+    agents_of = {"alpha": (0, 1), "bravo": (2,), "charlie": (3,)}
+    with_two = tuple(host.model_copy(update={"agents": agents_of[host.name]}) for host in one_each.hosts)
+    hosts = replace(one_each, hosts=with_two)
+    session = SharedSession()
+
+    def joined(me: str, listen: Sequence[str], opens: Callable[..., ZenohSession]) -> Bus:
+        return join_bus(
+            hosts.endpoint("alpha"),
+            "run",
+            me,
+            {STATUS: listen},
+            identity=hosts.identity("alpha"),
+            max_age_us=FOR_AGENTS_US,
+            utc_us=lambda: time.time_ns() // 1000,
+            opens=opens,
+        )
+
+    with hosts.router("alpha"):
+        supervisor = joined("alpha", ["agent-0", "agent-1"], ZenohSession)
+        agents = [joined("agent-0", ["agent-1"], session), joined("agent-1", ["agent-0"], session)]
+        buses, heard = [supervisor, *agents], [set[str](), set[str](), set[str]()]
+
+        def all_hear() -> bool:
+            for agent in agents:
+                agent.publish(STATUS, b"status")
+            time.sleep(0.02)
+            for bus, names in zip(buses, heard, strict=True):
+                names.update(sender for sender, payload in bus.receive(STATUS) if payload == b"status")
+            return heard == [{"agent-0", "agent-1"}, {"agent-1"}, {"agent-0"}]
+
+        assert until(all_hear)
+        assert [bus.refused() for bus in buses] == [[], [], []]
+        for bus in buses:
+            bus.close()
+        session.close()
 
 
 def test_senders_of_one_session_hear_each_other_without_a_router() -> None:

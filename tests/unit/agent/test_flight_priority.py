@@ -66,6 +66,14 @@ def test_who_hardly_sleeps_for_two_seconds_gives_it_up_once_and_says_so(process:
     assert process.events[-1]["spare_01"] < 0.1
 
 
+def test_a_pause_is_no_work(process: Process) -> None:
+    process.priority.ask()
+    process.fly(5.0, 10_000)
+    process.clock.advance(30_000_000)
+    process.fly(5.0, 10_000)
+    assert process.left == 0
+
+
 def test_who_was_not_granted_it_has_nothing_to_give_up(process: Process, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(flight_priority, "request_realtime", lambda: False)
     process.fly(5.0, 30_000)
