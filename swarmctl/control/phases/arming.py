@@ -26,6 +26,7 @@ class ArmingEvidence:
         self._settled_us: int | None = None  # a HEARTBEAT before this time proves nothing
         self._armed_us: int | None = None  # arrival of the HEARTBEAT that first told of being armed
         self._denied_us: int | None = None  # and of the first of those that tell the opposite since
+        self._disarmed_us: int | None = None  # since when it is known to be disarmed, without a break
 
     def request(self) -> None:
         """Note that arming is requested now."""
@@ -41,6 +42,14 @@ class ArmingEvidence:
         if self._settled_us is None or self._open:
             self._settled_us = inputs.now_us
         self._open = self._open and inputs.busy
+        if inputs.state is None or not self.is_disarmed(inputs, inputs.state):
+            self._disarmed_us = None
+        elif self._disarmed_us is None:
+            self._disarmed_us = inputs.now_us
+
+    def disarmed_for_us(self, now_us: int) -> int:
+        """Return for how long the vehicle has been known to be disarmed, as of this tick; 0 if it is not."""
+        return 0 if self._disarmed_us is None else now_us - self._disarmed_us
 
     def is_disarmed(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Return whether a HEARTBEAT newer than every arm request reports the vehicle as disarmed.

@@ -91,6 +91,34 @@ def test_long_after_it_was_armed_one_heartbeat_suffices() -> None:
     assert flight.at == "DONE"
 
 
+def test_a_vehicle_that_is_disarmed_and_said_to_be_in_the_air_is_not_landed_for_ever() -> None:
+    """The simulator's starts in the air hang there until they are flown; no autopilot lands what it does not arm."""
+    flight = Flight()
+    flight.landed, flight.unsettled = IN_AIR, "waits"
+    flight.run(0.2)
+    flight.ask("land")
+    flight.run(3.0)
+    assert flight.at == "LAND", "one that has just been disarmed may be falling, and is watched"
+    flight.run(3.0)
+    assert (flight.at, flight.mission.outcome) == ("DONE", OPERATOR_STOP)
+
+
+def test_negative_control_one_that_is_armed_meanwhile_is_landed_for_as_long_as_it_takes() -> None:
+    flight = Flight()
+    flight.landed, flight.unsettled = IN_AIR, "waits"
+    flight.run(0.2)
+    flight.ask("land")
+    flight.run(3.0)
+    flight.armed = True
+    flight.run(0.1)
+    flight.armed = False
+    flight.run(4.0)
+    assert flight.at == "LAND", "the five seconds begin anew"
+    flight.armed, flight.flight_mode = True, FlightMode.LAND
+    flight.run(60.0)
+    assert flight.at == "LAND"
+
+
 @pytest.mark.parametrize("mode", [FlightMode.HOLD, FlightMode.MANUAL])
 def test_a_refusal_after_an_arm_request_disarms_before_giving_up(mode: FlightMode) -> None:
     """PX4 is armed in the mode that it is in: on the ground that is no pilot's takeover."""

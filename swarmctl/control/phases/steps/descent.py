@@ -13,6 +13,7 @@ from swarmctl.core.types import Command, FlightMode, Landed, Phase, VehicleState
 _DESCENDS_M_S = 0.5  # of autopilots that land, at least
 _TOUCHES_DOWN_S = 3.0  # from the ground on, until nothing turns any more
 _STANDS_US = 5_000_000  # that an autopilot has to disarm by itself
+_MOTIONLESS_US = 5_000_000  # disarmed for as long, a vehicle is landed by nobody, wherever its autopilot says it is
 
 
 def goto_land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
@@ -59,7 +60,7 @@ def land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> lis
             mission.enter(Phase.DONE, inputs.now_us)
             return []
         return [Command(verb=Verb.HOLD)] if mission.may_request(inputs) else []
-    if mission.is_down(inputs, state):
+    if mission.is_down(inputs, state) or mission.arming.disarmed_for_us(inputs.now_us) >= _MOTIONLESS_US:
         mission.enter(Phase.DONE, inputs.now_us)
         return []
     if state.mode is FlightMode.LAND:
