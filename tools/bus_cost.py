@@ -23,9 +23,9 @@ import psutil
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, RELAY, STATUS, TICK, TRAJECTORY, Topic
-from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.zenoh_client import SCHEME
-from swarmctl.bus.zenoh_session import SharedSession, ZenohSession
+from swarmctl.bus.zenoh.bus import ZenohBus
+from swarmctl.bus.zenoh.client import SCHEME
+from swarmctl.bus.zenoh.session import SharedSession, ZenohSession
 from tests.benches.router_process import start_router
 
 SESSIONS: dict[str, Callable[[], Callable[..., ZenohSession]]] = {

@@ -16,10 +16,10 @@ import tempfile
 import time
 from collections.abc import Sequence
 
-import swarmctl.bus.zenoh_client as zenoh_client
+import swarmctl.bus.zenoh.client as zenoh_client
 from swarmctl.bus.topics import COMMAND, STATUS
-from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.zenoh_client import SCHEME
+from swarmctl.bus.zenoh.bus import ZenohBus
+from swarmctl.bus.zenoh.client import SCHEME
 from swarmctl.errors import StartError
 from tests.benches.router_process import start_router
 

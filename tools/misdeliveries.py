@@ -23,8 +23,8 @@ from collections.abc import Sequence
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.topics import PATH, STATUS, TICK, TRAJECTORY
-from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.zenoh_client import SCHEME
+from swarmctl.bus.zenoh.bus import ZenohBus
+from swarmctl.bus.zenoh.client import SCHEME
 from tests.benches.router_process import start_router
 
 SPEAKERS, LISTENERS = [agent_name(agent) for agent in range(12)], 3

@@ -35,7 +35,7 @@ from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.roster import OwnIdentity, identity_of_json
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.topics import PATH, STATUS, TICK, TRAJECTORY
-from swarmctl.bus.zenoh_client import SCHEME
+from swarmctl.bus.zenoh.client import SCHEME
 from swarmctl.config import Config, load
 from swarmctl.core.recorded.tick_record import TickRecord
 from swarmctl.core.types import Phase

@@ -30,8 +30,8 @@ from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.relay import RelayingBus
 from swarmctl.bus.silence import SessionWatch
 from swarmctl.bus.traffic import CountedBus
-from swarmctl.bus.zenoh_client import NO_BUS, socket_file
-from swarmctl.bus.zenoh_session import ZenohSession
+from swarmctl.bus.zenoh.client import NO_BUS, socket_file
+from swarmctl.bus.zenoh.session import ZenohSession
 from swarmctl.config import Config, load, own_identity
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.operator_verbs import Order

@@ -27,7 +27,7 @@ from swarmctl.agent.runner import (
     keep_from_collections,
 )
 from swarmctl.bus.bus import agent_name
-from swarmctl.bus.zenoh_session import SharedSession
+from swarmctl.bus.zenoh.session import SharedSession
 from swarmctl.config import load
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import ConfigError, SwarmError

@@ -77,7 +77,7 @@ def main() -> None:
 
 def _bus_is_blocked() -> bool:
     """Return whether the bus, where a verb has loaded it, would abort the process as the interpreter ends."""
-    bus = sys.modules.get("swarmctl.bus.zenoh_client")
+    bus = sys.modules.get("swarmctl.bus.zenoh.client")
     return bus is not None and bus.is_blocked()
 
 

@@ -24,7 +24,7 @@ import psutil
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.bus.network.router_links import RouterLinks
-from swarmctl.bus.zenoh_client import socket_file
+from swarmctl.bus.zenoh.client import socket_file
 from swarmctl.config import Config
 from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.text import printable

@@ -14,8 +14,8 @@ from pathlib import Path
 from swarmctl.bus.network.hosts import HostParams, links_of, roster_of
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.bus.topics import Topic
-from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.zenoh_client import SCHEME
+from swarmctl.bus.zenoh.bus import ZenohBus
+from swarmctl.bus.zenoh.client import SCHEME
 
 LOOPBACK = ipaddress.ip_address("127.0.0.1")
 

@@ -9,7 +9,7 @@ import pytest
 from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
 from swarmctl.bus.messages.json_messages import decode_status
-from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.peers.clocks import PeerClocks
 from swarmctl.config import load
 from swarmctl.core.clock import ClockError
 from tests.closed_loop.conftest import AT_100_HZ, Flight, mission_t_s

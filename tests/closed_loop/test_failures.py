@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import development as dialect
 
 from sitl.lockstep import Lockstep
 from swarmctl.agent.sensing import world_model
-from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.peers.paths import PeerPaths
 from swarmctl.control.mpc import judgement
 from swarmctl.control.mpc import swarm_mpc as mpc
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath

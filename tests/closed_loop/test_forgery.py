@@ -17,7 +17,7 @@ from swarmctl.bus.bus import agent_name
 from swarmctl.bus.messages.commitment_messages import decode_trajectory_message, encode_trajectory_message
 from swarmctl.bus.messages.json_messages import CommandMessage, decode_status, encode_message
 from swarmctl.bus.messages.path_messages import encode_path
-from swarmctl.bus.senders import ReceivedMessage, SenderVerifier, _Stream
+from swarmctl.bus.peers.senders import ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.core.types import Mode, Phase
 from swarmctl.telemetry.evaluation.referee import RunData, evaluate
 from tests import builders

@@ -13,7 +13,7 @@ from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.trials import Row
 from swarmctl.agent.planning.separation_policy import Guaranteed, SeparationDirective, SeparationInputs
 from swarmctl.bus.bus import agent_name
-from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.peers.clocks import PeerClocks
 from swarmctl.config import load
 from swarmctl.core.clock import ClockError
 from tests.benches.guaranteed_trials import COMMITTED_M, GUARANTEED_SWAP, TOUCH_M, events, flown

@@ -15,7 +15,7 @@ from sitl.studies.campaign.flight import TrialFlight, drawn
 from sitl.studies.campaign.trials import Trial
 from swarmctl.agent.flying import setpoint_output
 from swarmctl.agent.watches.alerts import Alert
-from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.peers.clocks import PeerClocks
 from swarmctl.config import Config, load
 from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.commit.tube import Tube

@@ -13,7 +13,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.agent.sharing.interest import Interest
 from swarmctl.bus import topics
 from swarmctl.bus.local.hub import LocalBus
-from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.peers.paths import PeerPaths
 from swarmctl.bus.topics import Topic
 from tests.closed_loop.conftest import Flight, closer_than, fly_now
 

@@ -12,7 +12,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.bus.bus import agent_name
-from swarmctl.bus.peer_trajectories import PeerTrajectories
+from swarmctl.bus.peers.trajectories import PeerTrajectories
 from tests.closed_loop.conftest import Flight, fly_now, mission_t_s
 
 GUARANTEED = ("sitl.start=air", "separation.mode=guaranteed")

@@ -13,8 +13,8 @@ from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.messages.path_messages import decode_path, encode_path
-from swarmctl.bus.peers import PeerPaths
-from swarmctl.bus.senders import SenderVerifier
+from swarmctl.bus.peers.paths import PeerPaths
+from swarmctl.bus.peers.senders import SenderVerifier
 from swarmctl.bus.topics import PATH, Topic
 from swarmctl.core.types import Array, PredictedPath
 from tests.closed_loop.test_guaranteed_cut_off import only_seen

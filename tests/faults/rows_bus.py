@@ -5,9 +5,9 @@ from __future__ import annotations
 from swarmctl.agent.planning import commitment_publisher, coordination
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.agent.sensing import world_model
-from swarmctl.bus import peers
 from swarmctl.bus.local import inboxes
-from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.peers import paths
+from swarmctl.bus.peers.paths import PeerPaths
 from tests.faults.bus_events import (
     BELIEVES_ALL,
     BUSY,
@@ -65,7 +65,7 @@ ROWS = (
         lasts_s=6.0,
         told=(r"agent-1 were refused \(path malformed \d+\)",),
         finally_={"they don't arrive": others_arrived},
-        off=Off(patches=((peers, "decode_path", lambda payload: unchecked(payload)),)),
+        off=Off(patches=((paths, "decode_path", lambda payload: unchecked(payload)),)),
     ),
     SimulatedRow(
         name="peer-replayed",

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from swarmctl.bus.marked_keys import MarkedPublisher
 from swarmctl.bus.refusals import HARMLESS, MISDELIVERED, RefusedMessage
 from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, STATUS, TICK, TOO_LONG
-from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.zenoh_client import COMMON_SETTINGS, SCHEME, close_session, open_session
+from swarmctl.bus.zenoh.bus import ZenohBus
+from swarmctl.bus.zenoh.client import COMMON_SETTINGS, SCHEME, close_session, open_session
+from swarmctl.bus.zenoh.marked_keys import MarkedPublisher
 from swarmctl.errors import EXIT_START, EXIT_USAGE, StartError
 from tests.benches.router_process import start_router
 
@@ -119,7 +119,7 @@ def test_a_killed_process_is_seen_at_once_and_a_frozen_one_within_its_lease(
     endpoint: str, join: Callable[..., ZenohBus]
 ) -> None:
     script = (
-        "import sys, time; from swarmctl.bus.zenoh_bus import ZenohBus\n"
+        "import sys, time; from swarmctl.bus.zenoh.bus import ZenohBus\n"
         f"bus = ZenohBus({endpoint!r}, 'run', sys.argv[1], {{}}, lease_ms=1000)\ntime.sleep(60)"
     )
     watcher = join("agent-0")
@@ -173,7 +173,7 @@ def test_router_lost_and_back() -> None:
 def test_a_flood_holds_up_no_tick(endpoint: str, join: Callable[..., ZenohBus]) -> None:
     """What comes while a ring is drained waits for the next tick."""
     script = (
-        "from swarmctl.bus.zenoh_bus import ZenohBus\nfrom swarmctl.bus.topics import PATH\n"
+        "from swarmctl.bus.zenoh.bus import ZenohBus\nfrom swarmctl.bus.topics import PATH\n"
         f"bus = ZenohBus({endpoint!r}, 'run', 'agent-1', {{}})\nwhile True: bus.publish(PATH, b'x' * 100)"
     )
     agent = join("agent-0", {PATH: ["agent-1"]})

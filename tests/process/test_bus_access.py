@@ -25,8 +25,8 @@ from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.bus.network.router import run_router
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.topics import COMMAND, ENDED, EVENT, MISSION, OBSTACLES, PATH, STATUS, Topic
-from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.zenoh_client import SCHEME
+from swarmctl.bus.zenoh.bus import ZenohBus
+from swarmctl.bus.zenoh.client import SCHEME
 from swarmctl.errors import StartError
 from tests.benches.free_ports import free_ports
 from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts

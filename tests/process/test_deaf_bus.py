@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 import zenoh
 
-import swarmctl.bus.zenoh_client as zenoh_client
+import swarmctl.bus.zenoh.client as zenoh_client
 from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.identities import make_identities
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.topics import COMMAND, PATH, STATUS
-from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.bus.zenoh.bus import ZenohBus
 from swarmctl.errors import StartError
 from tests.benches.free_ports import free_ports
 from tests.benches.router_process import start_router

@@ -13,11 +13,11 @@ import pytest
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.messages.path_messages import encode_path
-from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.peers.paths import PeerPaths
+from swarmctl.bus.peers.senders import SILENCE_US, Presence
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.senders import SILENCE_US, Presence
 from swarmctl.bus.topics import PATH
-from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.bus.zenoh.bus import ZenohBus
 from tests import builders
 from tests.process.test_bus import WAIT_S, end, endpoint, join  # noqa: F401  (fixtures)
 
@@ -29,7 +29,7 @@ PEER = """
 import sys, time
 import numpy as np
 from swarmctl.core.types import PredictedPath
-from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.bus.zenoh.bus import ZenohBus
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.bus.topics import PATH
 bus = ZenohBus(sys.argv[1], "run", "agent-1", {}, lease_ms=1000)

@@ -17,9 +17,9 @@ from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, STATUS
-from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.zenoh_client import CLOSE_DEADLINE_S, SCHEME
-from swarmctl.bus.zenoh_session import SharedSession, ZenohSession
+from swarmctl.bus.zenoh.bus import ZenohBus
+from swarmctl.bus.zenoh.client import CLOSE_DEADLINE_S, SCHEME
+from swarmctl.bus.zenoh.session import SharedSession, ZenohSession
 from tests.benches.free_ports import free_ports
 from tests.benches.router_process import start_router
 from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence, Set
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus
 from swarmctl.bus.messages.commitment_messages import encode_trajectory_message
-from swarmctl.bus.peer_trajectories import PeerTrajectories
+from swarmctl.bus.peers.trajectories import PeerTrajectories
 from swarmctl.bus.relay import missed_by_peers
 from swarmctl.control.commit.protocol import acknowledgements
 from swarmctl.control.commit.reach import FarPeers

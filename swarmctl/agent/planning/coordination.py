@@ -14,7 +14,7 @@ from swarmctl.agent.sensing.deviations import Deviations
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.peer_trajectories import PeerTrajectories
+from swarmctl.bus.peers.trajectories import PeerTrajectories
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
 from swarmctl.control.commit.commit_params import CommitParams

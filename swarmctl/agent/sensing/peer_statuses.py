@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import StatusMessage, decode_status
-from swarmctl.bus.peer_clocks import MOST_APART_US, PeerClocks
-from swarmctl.bus.peers import MAX_LEAD_US, peer_verifiers
+from swarmctl.bus.peers.clocks import MOST_APART_US, PeerClocks
+from swarmctl.bus.peers.paths import MAX_LEAD_US, peer_verifiers
+from swarmctl.bus.peers.senders import Presence, ReceivedMessage
+from swarmctl.bus.peers.vouched_ends import VouchedEnds
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Presence, ReceivedMessage
-from swarmctl.bus.vouched_ends import VouchedEnds
 from swarmctl.control.estimation.flown_by_others import CREEP_M_S
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.types import FLOWN_BY_AGENT, FlightMode, Landed, Phase

@@ -13,10 +13,10 @@ from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import StatusMessage
 from swarmctl.bus.messages.path_messages import stamp_us
 from swarmctl.bus.orders import Orders
-from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.peers.clocks import PeerClocks
+from swarmctl.bus.peers.paths import PeerPaths
+from swarmctl.bus.peers.senders import Presence
 from swarmctl.bus.refusals import LATE, Refusals
-from swarmctl.bus.senders import Presence
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.collision.separation import (
     KeepOuts,

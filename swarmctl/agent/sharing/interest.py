@@ -13,7 +13,7 @@ from swarmctl.agent.sharing.far_paths import UNTOLD_MARGIN_M, speed_bound_m_s
 from swarmctl.agent.sharing.path_sharing import PathSharingParams
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
-from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.peers.paths import PeerPaths
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.types import PredictedPath, VehicleState
 

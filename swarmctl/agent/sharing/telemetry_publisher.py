@@ -12,7 +12,7 @@ from swarmctl.agent.watches.alerts import Alert
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus
 from swarmctl.bus.messages.json_messages import MAX_REASON, AnswerMessage, StatusMessage, encode_message
-from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.peers.paths import PeerPaths
 from swarmctl.control.estimation.disturbance import Estimate
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.core.clock import Clock

@@ -20,12 +20,12 @@ from typing import Any
 
 import zenoh
 
-from swarmctl.bus.marked_keys import MarkedPublisher, is_misdelivered
 from swarmctl.bus.network.datagram_routes import BEAT_S, Address, DatagramRoutes, Outgoing
 from swarmctl.bus.network.roster import OwnIdentity, split_address
 from swarmctl.bus.network.seals import PairKeys
 from swarmctl.bus.topics import TOPICS
-from swarmctl.bus.zenoh_client import CLOSE_DEADLINE_S, close_within
+from swarmctl.bus.zenoh.client import CLOSE_DEADLINE_S, close_within
+from swarmctl.bus.zenoh.marked_keys import MarkedPublisher, is_misdelivered
 from swarmctl.errors import StartError
 
 _PREFIX = "swarm/"

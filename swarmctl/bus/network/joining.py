@@ -11,9 +11,9 @@ from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.bus.network.sealed_bus import SealedBus
 from swarmctl.bus.network.seals import Sealer, SealVerifier, overhead_bytes
 from swarmctl.bus.topics import Topic
-from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.zenoh_client import CONNECT_TIMEOUT_MS
-from swarmctl.bus.zenoh_session import ZenohSession
+from swarmctl.bus.zenoh.bus import ZenohBus
+from swarmctl.bus.zenoh.client import CONNECT_TIMEOUT_MS
+from swarmctl.bus.zenoh.session import ZenohSession
 
 
 def join_bus(

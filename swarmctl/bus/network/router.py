@@ -23,7 +23,7 @@ import zenoh
 
 from swarmctl.bus.network.roster import identity_of_json
 from swarmctl.bus.network.router_links import RouterLinks
-from swarmctl.bus.zenoh_client import CLOSE_DEADLINE_S, COMMON_SETTINGS, SCHEME, close_within, open_session, socket_file
+from swarmctl.bus.zenoh.client import CLOSE_DEADLINE_S, COMMON_SETTINGS, SCHEME, close_within, open_session, socket_file
 from swarmctl.errors import EXIT_OK, StartError, SwarmError
 from swarmctl.process_lifetime import die_with_parent, remove_socket
 from swarmctl.process_priority import request_realtime

@@ -37,7 +37,7 @@ any one of the rules two do. The figures are in docs/safety_case.md.
 The proof rests on these assumptions, each of which is watched in flight:
 
 - Clocks are known to within an error, which is measured: offsets of peers' clocks are taken from these messages and
-  corrected (`swarmctl.bus.peer_clocks`), and the error that is left, a round trip at most, goes with every trajectory
+  corrected (`swarmctl.bus.peers.clocks`), and the error that is left, a round trip at most, goes with every trajectory
   received. From one that is flown at speed v by a clock known to e, rules 2 and 4 keep v e more, and so does the safety
   filter (`Trajectory.spread_m`): of each pair of trajectories that the proof speaks of, one agent has checked the other
   one's, with room for all that it does not know of the other's clock. Beyond `agent.commit.clock_error_max_s` of a peer

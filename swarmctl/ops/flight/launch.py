@@ -24,7 +24,7 @@ from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.router_links import RouterLinks
 from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
 from swarmctl.bus.topics import ENDED, EVENT, OBSTACLES, OPERATOR, STATUS, TICK, Topic
-from swarmctl.bus.zenoh_client import NO_BUS, SCHEME, socket_file
+from swarmctl.bus.zenoh.client import NO_BUS, SCHEME, socket_file
 from swarmctl.config import Config, dump
 from swarmctl.configuration.config_warnings import launch_warning_lines
 from swarmctl.core.json_safe import to_json

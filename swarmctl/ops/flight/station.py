@@ -17,8 +17,8 @@ from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import EndedMessage, ObstaclesMessage, StatusMessage
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
+from swarmctl.bus.peers.vouched_ends import VouchedEnds
 from swarmctl.bus.topics import TICK
-from swarmctl.bus.vouched_ends import VouchedEnds
 from swarmctl.config import Config, own_identity
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.obstacle import Obstacle

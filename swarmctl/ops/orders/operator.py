@@ -18,8 +18,8 @@ from swarmctl.bus.messages.json_messages import StatusMessage, decode_status
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
+from swarmctl.bus.peers.vouched_ends import VouchedEnds
 from swarmctl.bus.topics import ANSWER, ENDED, OBSTACLES, OPERATOR, STATUS
-from swarmctl.bus.vouched_ends import VouchedEnds
 from swarmctl.errors import StartError
 from swarmctl.ops.running_launches import RunningLaunch, refuse_ending, runs
 from swarmctl.wall_clock import monotonic_us

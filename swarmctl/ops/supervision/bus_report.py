@@ -7,10 +7,10 @@ from functools import partial
 
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.messages.json_messages import EndedMessage, StatusMessage, decode_status
+from swarmctl.bus.peers.vouched_ends import VouchedEnds
 from swarmctl.bus.refusals import HARMLESS, IDENTITY, MALFORMED, Refusals
 from swarmctl.bus.silence import SessionWatch
 from swarmctl.bus.topics import ENDED, EVENT, STATUS
-from swarmctl.bus.vouched_ends import VouchedEnds
 from swarmctl.ops.supervision.status_table import Display
 from swarmctl.telemetry.recording.shared_events import taken_event
 from swarmctl.wall_clock import monotonic_us

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from swarmctl.bus.zenoh_client import SCHEME
+from swarmctl.bus.zenoh.client import SCHEME
 from swarmctl.check.parameters import names_to_read
 from swarmctl.check.scan.link_facts import VehicleFacts
 from swarmctl.check.scan.listener import NOWHERE, Address, Listener, UdpListener, open_listener

@@ -11,9 +11,9 @@ from swarmctl.bus import topics
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalBus, LocalHub
 from swarmctl.bus.messages.path_messages import encode_path
-from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.peers.paths import PeerPaths
+from swarmctl.bus.peers.senders import Presence
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.senders import Presence
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.clock import SimClock
 from tests import builders

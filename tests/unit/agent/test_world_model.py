@@ -29,9 +29,9 @@ from swarmctl.bus.messages.json_messages import (
 )
 from swarmctl.bus.messages.path_messages import encode_path
 from swarmctl.bus.network.hosts import HostParams
-from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.peers.clocks import PeerClocks
+from swarmctl.bus.peers.senders import Presence
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.senders import Presence
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.clock import SimClock

@@ -29,7 +29,7 @@ from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US, SealedBus
 from swarmctl.bus.network.seals import TAG_BYTES, PairKeys, Sealer, SealVerifier, overhead_bytes
-from swarmctl.bus.peer_trajectories import PeerTrajectories
+from swarmctl.bus.peers.trajectories import PeerTrajectories
 from swarmctl.bus.refusals import MISDELIVERED, RefusedMessage
 from swarmctl.bus.relay import RelayingBus, encode_relay
 from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, PATH, RELAY, STATUS, TRAJECTORY, Topic

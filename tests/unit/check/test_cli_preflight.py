@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from swarmctl.bus.messages.json_messages import StatusMessage
-from swarmctl.bus.zenoh_client import SCHEME
+from swarmctl.bus.zenoh.client import SCHEME
 from swarmctl.config import Config, dump, load
 from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.types import Phase

@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-import swarmctl.bus.zenoh_client  # noqa: F401  (a verb that uses the bus has loaded it)
+import swarmctl.bus.zenoh.client  # noqa: F401  (a verb that uses the bus has loaded it)
 from swarmctl.ops import cli
 
 

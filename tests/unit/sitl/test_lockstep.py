@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep, _is_due
-from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.peers.clocks import PeerClocks
 from swarmctl.config import load
 from swarmctl.core.clock import ClockError, OffsetClock, SimClock
 from swarmctl.errors import ConfigError

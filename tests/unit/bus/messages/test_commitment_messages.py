@@ -18,10 +18,10 @@ from swarmctl.bus.messages.commitment_messages import (
     decode_trajectory_message,
     encode_trajectory_message,
 )
-from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peer_trajectories import MAX_CLOCK_ERROR_US, PeerTrajectories
+from swarmctl.bus.peers.clocks import PeerClocks
+from swarmctl.bus.peers.senders import Presence
+from swarmctl.bus.peers.trajectories import MAX_CLOCK_ERROR_US, PeerTrajectories
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.senders import Presence
 from swarmctl.control.commit.protocol import acknowledgements
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping

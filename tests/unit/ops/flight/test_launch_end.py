@@ -20,7 +20,7 @@ from swarmctl.bus.bus import agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.messages.json_messages import EndedMessage, encode_message
 from swarmctl.bus.topics import ENDED, OPERATOR, STATUS
-from swarmctl.bus.zenoh_client import SCHEME
+from swarmctl.bus.zenoh.client import SCHEME
 from swarmctl.config import Config, load
 from swarmctl.core.operator_verbs import Order
 from swarmctl.errors import ConfigError, StartError

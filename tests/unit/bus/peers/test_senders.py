@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from swarmctl.bus.local.hub import LocalBus, LocalHub
+from swarmctl.bus.peers.senders import SILENCE_US, Arrivals, Presence, ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.bus.refusals import HARMLESS, Refusals
-from swarmctl.bus.senders import SILENCE_US, Arrivals, Presence, ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.core.clock import SimClock
 
 RATE_HZ, TICK_US = 50.0, 20_000

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.peers.clocks import PeerClocks
 
 UTC_US = 1_700_000_000_000_000
 SECOND_US = 1_000_000

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from swarmctl.bus.messages.json_messages import EndedMessage, encode_message
+from swarmctl.bus.peers.vouched_ends import VouchedEnds
 from swarmctl.bus.refusals import IDENTITY, MALFORMED, SEQUENCE
-from swarmctl.bus.vouched_ends import VouchedEnds
 
 ALPHA, BRAVO = "alpha", "bravo"
 MOST = 64  # processes of one agent

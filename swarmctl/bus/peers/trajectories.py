@@ -8,10 +8,10 @@ from itertools import takewhile
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.messages.commitment_messages import Memory, decode_trajectory_message
-from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import MAX_LEAD_US, peer_verifiers
+from swarmctl.bus.peers.clocks import PeerClocks
+from swarmctl.bus.peers.paths import MAX_LEAD_US, peer_verifiers
+from swarmctl.bus.peers.senders import Presence, ReceivedMessage
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Presence, ReceivedMessage
 from swarmctl.bus.topics import TRAJECTORY
 from swarmctl.core.trajectory_message import Exclusions, TrajectoryMessage
 

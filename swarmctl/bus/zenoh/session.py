@@ -19,11 +19,10 @@ from typing import Any
 import zenoh
 
 from swarmctl.bus.bus import DEFAULT_LEASE_MS
-from swarmctl.bus.marked_keys import Inbox, MarkedPublisher, drain
 from swarmctl.bus.refusals import MISDELIVERED, MOST_REFUSED, RefusedMessage
 from swarmctl.bus.silence import DEAF_S, SilenceWatch
 from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
-from swarmctl.bus.zenoh_client import (
+from swarmctl.bus.zenoh.client import (
     CLOSE_DEADLINE_S,
     CONNECT_TIMEOUT_MS,
     THREADS,
@@ -33,6 +32,7 @@ from swarmctl.bus.zenoh_client import (
     run_within,
     socket_file,
 )
+from swarmctl.bus.zenoh.marked_keys import Inbox, MarkedPublisher, drain
 from swarmctl.errors import StartError
 
 _TOKEN = "alive"  # name of the keys of liveliness tokens

@@ -1,7 +1,7 @@
 """The newest path of every peer.
 
-`PeerPaths` judges freshness by the payload, never by the bus, and identity by `swarmctl.bus.senders`. It keeps every
-peer's newest path whatever its age; what an old path means for separation is decided in `swarmctl.control`.
+`PeerPaths` judges freshness by the payload, never by the bus, and identity by `swarmctl.bus.peers.senders`. It keeps
+every peer's newest path whatever its age; what an old path means for separation is decided in `swarmctl.control`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from collections.abc import Iterable
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.messages.path_messages import decode_path, longest_step_m
-from swarmctl.bus.peer_clocks import PeerClocks
+from swarmctl.bus.peers.clocks import PeerClocks
+from swarmctl.bus.peers.senders import Presence, ReceivedMessage, SenderVerifier
 from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
 from swarmctl.bus.topics import PATH, Topic
 from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
 

@@ -9,10 +9,10 @@ import pytest
 
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.messages.path_messages import encode_path
-from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import PeerPaths
+from swarmctl.bus.peers.clocks import PeerClocks
+from swarmctl.bus.peers.paths import PeerPaths
+from swarmctl.bus.peers.senders import Presence
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.senders import Presence
 from tests import builders
 
 NOW_US = 1_700_000_000_000_000

@@ -1,6 +1,6 @@
-"""The Zenoh bus: how one agent or operator publishes and receives by a session (`swarmctl.bus.zenoh_session`).
+"""The Zenoh bus: how one agent or operator publishes and receives by a session (`swarmctl.bus.zenoh.session`).
 
-`swarmctl.bus.peers` judges freshness from the payload; nothing here looks into a payload.
+`swarmctl.bus.peers.paths` judges freshness from the payload; nothing here looks into a payload.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from swarmctl.bus.bus import DEFAULT_LEASE_MS, Bus
 from swarmctl.bus.refusals import RefusedMessage
 from swarmctl.bus.silence import DEAF_S
 from swarmctl.bus.topics import Topic
-from swarmctl.bus.zenoh_client import CONNECT_TIMEOUT_MS
-from swarmctl.bus.zenoh_session import ZenohSession
+from swarmctl.bus.zenoh.client import CONNECT_TIMEOUT_MS
+from swarmctl.bus.zenoh.session import ZenohSession
 
 
 class ZenohBus(Bus):
