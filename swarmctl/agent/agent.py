@@ -40,6 +40,7 @@ from swarmctl.agent.watches.deadline_watch import DeadlineWatch
 from swarmctl.agent.watches.destination_watch import DestinationWatch
 from swarmctl.agent.watches.vehicle_watch import VehicleWatch
 from swarmctl.control.failsafe.overload import Level
+from swarmctl.control.phases.handover import withdrawn_verbs
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
@@ -54,6 +55,7 @@ from swarmctl.core.types import (
     Plan,
     PlanStatus,
     VehicleState,
+    Verb,
 )
 
 
@@ -163,6 +165,11 @@ class Agent:
         return self._ports.bus.heard_bytes
 
     @property
+    def heard_us(self) -> int:
+        """Monotonic time at which the vehicle's newest frame has arrived; 0 before the first."""
+        return self._ports.autopilot.received_us or 0
+
+    @property
     def refused_frames(self) -> dict[str, int]:
         """Number of the vehicle's MAVLink frames refused so far, by reason."""
         return dict(self._ports.autopilot.refusals.by_reason)
@@ -264,8 +271,10 @@ class Agent:
         """Take in what the vehicle has sent; return its newest state."""
         autopilot, commands = self._ports.autopilot, self._ports.commands
         state = autopilot.poll(now_us)
+        commands.withdraw(withdrawn_verbs(self._mission, state))
         commands.step(now_us, heartbeat=autopilot.is_attended(now_us))
         for result in commands.results():
+            self._mission.arming.accepted |= result.ok and result.command.verb is Verb.ARM
             self._vehicle_setup.on_result(result)
             self._vehicle_watch.on_result(result, now_us)
         self._vehicle_watch.report_text()

@@ -56,7 +56,7 @@ _RUN, _RUN_IN_WORDS = re.compile(r"^[^/*$#?\s]+$"), "without spaces and / * $ # 
 _LINGER_S = 1.0  # time the process lives on after its end, so that peers receive the last status
 _STOP_REPEAT_US = 1_000_000
 NOTHING_REFUSED: Mapping[str, int] = MappingProxyType({})
-_VEHICLE_LOST_S = 15.0  # time without any vehicle state after which the process gives up
+_VEHICLE_LOST_S = 15.0  # time without any frame of the vehicle after which the process gives up
 
 
 class Pace:
@@ -371,8 +371,9 @@ class RealTimeAgent:
         record = agent.tick(now_us, self._pace.missed)
         self._sessions.step()
         self._pace.done(now_us + round(record.timing.tick_ms * 1000), self._clock.now_us())
-        if record.mode is not Mode.STATE_STALE:
-            self._seen_us, self._ever_seen = now_us, True
+        self._ever_seen = self._ever_seen or record.mode is not Mode.STATE_STALE
+        if self._ever_seen:  # who is heard without a position may be armed, and flown by somebody
+            self._seen_us = max(self._seen_us, agent.heard_us)
         if not agent.done:  # who has landed waits for its peers, and may be switched off
             silent_us = now_us - self._seen_us
             _check_vehicle_silence(silent_us, self._ever_seen, self._config, self._vehicle, agent.refused_frames)

@@ -119,7 +119,10 @@ def _as_configured(name: str, facts: VehicleFacts, config: Config, rule: Rule | 
     if broken:
         return Opinion(verdict=Verdict.FIX, wanted=wanted, advice=f"the configuration asks for it: {broken}")
     if value is None:
-        advice = f"this autopilot has no such parameter; remove agent.autopilot_params.{name}"
+        remove = f"this autopilot has no such parameter: remove agent.autopilot_params.{name}"
+        told = (facts.parameters or {}).get(name)  # ArduCopters say nothing of parameters that they don't have
+        is_known = told is not None and told.refused
+        advice = remove if is_known else f"not answered: look at the loss of the link, unless {remove}"
         return Opinion(verdict=Verdict.NOTE if rule is None else Verdict.FIX, wanted=wanted, advice=advice)
     if math.isclose(value, want, rel_tol=1e-6, abs_tol=1e-9):
         return ok(wanted)

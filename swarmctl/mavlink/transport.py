@@ -316,10 +316,15 @@ class SerialTransport:
     """
 
     def __init__(self, device: str, baud: int) -> None:
+        import termios
+
         import serial  # only serial links need it
 
         def open_port() -> Any:
-            return serial.Serial(device, baud, timeout=0, exclusive=True)
+            try:
+                return serial.Serial(device, baud, timeout=0, exclusive=True)
+            except termios.error as error:  # the device has vanished while it was being set up
+                raise OSError(*error.args) from error
 
         self._open_port: Callable[[], Any] = open_port
         try:

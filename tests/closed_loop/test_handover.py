@@ -21,6 +21,7 @@ from swarmctl.control.reference.heading import Heading
 from swarmctl.core.frames import euler_from_quat
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import PipeTransport
 from swarmctl.mavlink.vehicle import mode_watch, state_samples
@@ -193,6 +194,44 @@ def test_after_a_reboot_in_flight_nothing_is_armed_again_and_the_outcome_says_wh
         "set up again, or set back"
     )
     assert (flight.agent.finished, flight.agent.outcome) == (True, REBOOTED)
+
+
+# -- A request whose answer is lost is repeated, but not against a pilot -----------------------------------------------
+
+ACK = 77  # COMMAND_ACK
+
+
+def taken_while_a_request_is_unanswered() -> Watched:
+    """The vehicle obeys the request for control, its answer is lost, and a ground station takes it at once."""
+    flight = Watched("sitl.start=air")
+    vehicles = flight.run.links[0][1]
+
+    def send(data: bytes) -> None:
+        kept = [frame for frame in frames(data) if message_id(frame) != ACK or flight.agent._mission.phase < Phase.ARM]
+        if kept:
+            PipeTransport.send(vehicles, b"".join(kept))
+
+    vehicles.send = send  # type: ignore[method-assign]
+    while not flight.offboard_us:
+        flight.step_for(0.02)
+        assert flight.now_us < 60_000_000
+    hold = mavlink.MAVLink_command_long_message(1, 1, 176, 0, 1.0, 4.0, 3.0, 0, 0, 0, 0)
+    PipeTransport.send(flight.run.links[0][0], Codec(255, 190).encode(hold))
+    flight.step_for(0.1)
+    flight.offboard_us.clear()
+    flight.step_for(3.0)
+    return flight
+
+
+def test_control_is_not_asked_for_again_once_somebody_else_has_taken_it() -> None:
+    flight = taken_while_a_request_is_unanswered()
+    assert flight.offboard_us == []
+    assert flight.agent.outcome == TAKEN_OVER
+
+
+def test_negative_control_a_repeated_request_takes_the_vehicle_from_its_pilot(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(CommandPort, "withdraw", lambda *_: None)
+    assert taken_while_a_request_is_unanswered().offboard_us
 
 
 # -- ArduCopter -------------------------------------------------------------------------------------------------------

@@ -18,19 +18,22 @@ class ArmingEvidence:
 
     Attributes:
         requested: whether this agent has asked the autopilot to arm.
+        accepted: whether the autopilot has agreed to the newest request: its motors turn before a HEARTBEAT tells.
     """
 
     def __init__(self) -> None:
-        self.requested = False
+        self.requested = self.accepted = False
         self._open = False  # an arm request may still be on its way
         self._settled_us: int | None = None  # a HEARTBEAT before this time proves nothing
         self._armed_us: int | None = None  # arrival of the HEARTBEAT that first told of being armed
         self._denied_us: int | None = None  # and of the first of those that tell the opposite since
-        self._disarmed_us: int | None = None  # since when it is known to be disarmed, without a break
+        self._disarmed_us: int | None = None  # arrival of the first HEARTBEAT by which it is known to be disarmed
+        self._told_us = 0  # and of the newest one
 
     def request(self) -> None:
         """Note that arming is requested now."""
         self.requested = self._open = True
+        self.accepted = False
 
     def update(self, inputs: PhaseInputs) -> None:
         """Advance by one tick, before this tick's requests.
@@ -42,14 +45,16 @@ class ArmingEvidence:
         if self._settled_us is None or self._open:
             self._settled_us = inputs.now_us
         self._open = self._open and inputs.busy
+        self._told_us = inputs.armed_told_us
         if inputs.state is None or not self.is_disarmed(inputs, inputs.state):
             self._disarmed_us = None
         elif self._disarmed_us is None:
-            self._disarmed_us = inputs.now_us
+            self._disarmed_us = self._told_us
 
-    def disarmed_for_us(self, now_us: int) -> int:
-        """Return for how long the vehicle has been known to be disarmed, as of this tick; 0 if it is not."""
-        return 0 if self._disarmed_us is None else now_us - self._disarmed_us
+    @property
+    def disarmed_for_us(self) -> int:
+        """Time from the first HEARTBEAT by which the vehicle is known to be disarmed to the newest; 0 if it is not."""
+        return 0 if self._disarmed_us is None else self._told_us - self._disarmed_us
 
     def is_disarmed(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Return whether a HEARTBEAT newer than every arm request reports the vehicle as disarmed.

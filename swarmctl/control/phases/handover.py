@@ -11,6 +11,12 @@ from swarmctl.core.types import Command, FlightMode, Mode, Phase, VehicleState, 
 _GONE_US = 3_000_000
 OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes that follow from our own requests
 
+_NO_VERBS = frozenset[Verb]()
+_CLIMB_VERBS = frozenset((Verb.TAKEOFF,))
+_CONTROL_VERBS = frozenset((Verb.EXTERNAL,))
+_DEPARTURE_VERBS = frozenset((Verb.ARM, Verb.TAKEOFF, Verb.EXTERNAL))
+_FLIGHT_VERBS = _DEPARTURE_VERBS | {Verb.DISARM, Verb.HOLD, Verb.LAND}
+
 
 def is_under_other_control(state: VehicleState) -> bool:
     """Return whether a pilot, a ground station or a failsafe controls the vehicle."""
@@ -25,6 +31,21 @@ def is_taken_over(mission: MissionState, inputs: PhaseInputs, state: VehicleStat
         return inputs.mode is Mode.PILOT_OVERRIDE
     mission.gone_us = inputs.now_us if mission.gone_us is None else mission.gone_us
     return inputs.now_us - mission.gone_us > _GONE_US
+
+
+def withdrawn_verbs(mission: MissionState, state: VehicleState | None) -> frozenset[Verb]:
+    """Return what is no longer asked of the autopilot, although it has not answered yet.
+
+    A repetition would take the vehicle from a pilot whose agent flies it no more, or arm it after a stop.
+    """
+    if mission.pilot_override:
+        return _FLIGHT_VERBS
+    if mission.phase >= Phase.LAND:
+        return _DEPARTURE_VERBS
+    others = state is not None and state.armed and is_under_other_control(state)
+    if others and not mission.may_take_control:
+        return _CONTROL_VERBS
+    return _CLIMB_VERBS if mission.climb.abandoned else _NO_VERBS
 
 
 def request_control(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:

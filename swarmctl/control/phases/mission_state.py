@@ -32,6 +32,7 @@ COMPLETED = "completed"  # the outcome of a mission that was flown to its end
 _TAKES_BACK_US = 5_000_000  # from an operator's resume, for which the autopilot may take to follow setpoints again
 ASKS_US = 30_000_000  # from the same, for which the autopilot is asked to; later nobody would expect that it does
 TAKEN_OVER = "pilot or autopilot took over"
+DISARMED = "disarmed before take-off"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

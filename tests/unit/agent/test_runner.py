@@ -174,6 +174,7 @@ def test_who_has_landed_may_be_switched_off_while_its_agent_waits_for_peers(has_
     seen = SimpleNamespace(mode=Mode.TRACKING, timing=SimpleNamespace(tick_ms=1.0))
 
     class Landed:
+        heard_us = 1_000_000
         ask, refused_frames, outcome, has_armed = None, NOTHING_REFUSED, "completed", True
         done = has_landed
 
@@ -184,24 +185,52 @@ def test_who_has_landed_may_be_switched_off_while_its_agent_waits_for_peers(has_
         def finished(self) -> bool:
             return clock.now_us() > 40_000_000  # when the last peer is done
 
-    def fly() -> int:
-        def sleep_until(t_us: int) -> None:
-            clock.advance(max(1, t_us - clock.now_us()))
-
-        agent: Any = Landed()
-        paced: Any = SimpleNamespace(now_us=clock.now_us, sleep_until=sleep_until)
-        stop: Any = SimpleNamespace(count=0)
-        sessions: Any = SimpleNamespace(step=lambda: None)
-        flight = RealTimeAgent(
-            agent, load(None), paced, stop, sessions, note=print, vehicle="udpin://x", only_land=False
-        )
-        return _fly(flight, paced, FlightPriority(paced, print)).exit_code
-
     if has_landed:
-        assert fly() == EXIT_OK
+        assert flown(Landed(), clock) == EXIT_OK
     else:
         with pytest.raises(MissionError, match="silent for 15 s"):
-            fly()
+            flown(Landed(), clock)
+
+
+@pytest.mark.parametrize("had_position", [True, False])
+def test_a_vehicle_that_is_heard_without_a_position_is_not_silent(had_position: bool) -> None:
+    """A pilot may fly it by hand without GPS: whoever gave it up would leave it without the agent's heartbeat."""
+    clock = SimClock()
+    modes = (Mode.TRACKING if had_position else Mode.STATE_STALE, Mode.STATE_STALE)
+    timing = SimpleNamespace(tick_ms=1.0)
+
+    class Heard:
+        ask, refused_frames, outcome, has_armed, done = None, NOTHING_REFUSED, "completed", True, False
+
+        @property
+        def heard_us(self) -> int:
+            return clock.now_us()
+
+        def tick(self, now_us: int, missed: int) -> Any:
+            return SimpleNamespace(mode=modes[now_us >= 1_000_000], timing=timing)
+
+        @property
+        def finished(self) -> bool:
+            return clock.now_us() > 90_000_000
+
+    if had_position:
+        assert flown(Heard(), clock) == EXIT_OK
+    else:
+        with pytest.raises(StartError, match="no heartbeat and position within"):
+            flown(Heard(), clock)
+
+
+def flown(agent: Any, clock: SimClock) -> int:
+    """Fly a scripted agent in real time's loop, on a simulated clock; return its exit code."""
+
+    def sleep_until(t_us: int) -> None:
+        clock.advance(max(1, t_us - clock.now_us()))
+
+    paced: Any = SimpleNamespace(now_us=clock.now_us, sleep_until=sleep_until)
+    stop: Any = SimpleNamespace(count=0)
+    sessions: Any = SimpleNamespace(step=lambda: None)
+    flight = RealTimeAgent(agent, load(None), paced, stop, sessions, note=print, vehicle="udpin://x", only_land=False)
+    return _fly(flight, paced, FlightPriority(paced, print)).exit_code
 
 
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="Linux alone tells how long it was suspended")

@@ -494,6 +494,17 @@ def test_a_parameter_of_another_kind_of_autopilot_is_only_a_note(config: Config)
     assert line.verdict is NOTE and "no such parameter" in line.advice
 
 
+@pytest.mark.parametrize(
+    ("refused", "begins"), [(True, "this autopilot has no such"), (False, "not answered: look at")]
+)
+def test_a_parameter_that_was_not_answered_may_exist(config: Config, refused: bool, begins: str) -> None:
+    """On a link that loses requests it is no reason to take the parameter out of the configuration."""
+    stored = {**parameters(PX4_VALUES), "MPC_XY_CRUISE": Parameter(name="MPC_XY_CRUISE", value=None, refused=refused)}
+    asked = with_params(config, MPC_XY_CRUISE=3.0)
+    line = line_of(findings([changed(HEALTHY, parameters=stored)], asked), "MPC_XY_CRUISE")
+    assert line.advice.startswith(begins)
+
+
 def test_one_board_under_two_urls_is_found_and_two_simulators_are_not_one_board(config: Config) -> None:
     same = Version(firmware=(1, 18, 0), stage="release", git="", board=50, uid="3a91", bytewise=True, vendor=0x3185)
     lines = findings([changed(HEALTHY, version=same), changed(SECOND_OK, version=same)], config)

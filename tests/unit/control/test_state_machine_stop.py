@@ -7,6 +7,7 @@ import pytest
 
 from swarmctl.control.failsafe.decision import Escalation, Response
 from swarmctl.control.failsafe.overload import Level
+from swarmctl.control.phases.handover import withdrawn_verbs
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.types import FlightMode, Mode, Phase, Verb
@@ -101,6 +102,57 @@ def test_a_vehicle_that_is_disarmed_and_said_to_be_in_the_air_is_not_landed_for_
     assert flight.at == "LAND", "one that has just been disarmed may be falling, and is watched"
     flight.run(3.0)
     assert (flight.at, flight.mission.outcome) == ("DONE", OPERATOR_STOP)
+
+
+def test_one_heartbeat_before_the_link_falls_silent_ends_no_landing() -> None:
+    """It may be a copy of one from before the vehicle was armed."""
+    flight = Flight().until(Phase.LAND)
+    flight.flight_mode, flight.landed, flight.armed = FlightMode.LAND, IN_AIR, True
+    flight.run(6.0)
+    flight.armed, flight.beat_us = False, flight.now_us
+    flight.run(30.0)
+    assert flight.at == "LAND"
+
+
+def test_a_vehicle_that_a_pilot_disarms_before_its_first_heartbeat_is_not_armed_again() -> None:
+    flight = asked_to_arm(busy=False)
+    flight.mission.arming.accepted = True
+    assert flight.run(1.0) == []
+    flight.beat_us = flight.now_us
+    assert flight.run(1.0) == []
+    assert flight.at == "ARM", "one HEARTBEAT may be older than the answer"
+    flight.beat_us = flight.now_us
+    assert Verb.ARM not in flight.run(0.2)
+    assert (flight.at, flight.mission.outcome) == ("DONE", "disarmed before take-off")
+
+
+def test_negative_control_a_request_that_was_not_accepted_is_repeated() -> None:
+    assert Verb.ARM in asked_to_arm(busy=False).run(1.5)
+
+
+@pytest.mark.parametrize(
+    ("phase", "withdrawn"),
+    [
+        (Phase.ARM, set()),
+        (Phase.TAKEOFF, set()),
+        (Phase.GOTO_START, set()),
+        (Phase.LAND, {Verb.ARM, Verb.TAKEOFF, Verb.EXTERNAL}),
+        (Phase.DONE, {Verb.ARM, Verb.TAKEOFF, Verb.EXTERNAL}),
+    ],
+)
+def test_what_leads_into_the_air_is_withdrawn_by_a_stop(phase: Phase, withdrawn: set[Verb]) -> None:
+    flight = Flight().until(phase)
+    assert withdrawn_verbs(flight.mission, flight.state) == withdrawn
+
+
+def test_nothing_more_is_asked_of_a_vehicle_that_a_pilot_has() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.flight_mode, flight.failsafe_mode = FlightMode.MANUAL, Mode.PILOT_OVERRIDE
+    assert withdrawn_verbs(flight.mission, flight.state) == {Verb.EXTERNAL}, "in the tick that hears of it"
+    flight.run(0.1)
+    assert withdrawn_verbs(flight.mission, flight.state) >= {Verb.EXTERNAL, Verb.HOLD, Verb.LAND, Verb.DISARM}
+    assert flight.ask("resume") == ""
+    assert withdrawn_verbs(flight.mission, flight.state) == set(), "it is taken back from the pilot's mode"
 
 
 def test_negative_control_one_that_is_armed_meanwhile_is_landed_for_as_long_as_it_takes() -> None:

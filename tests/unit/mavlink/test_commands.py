@@ -227,10 +227,106 @@ def test_takeoff_height_goes_into_the_parameter_before_the_command() -> None:
 def test_takeoff_is_not_asked_for_when_its_height_was_not_taken() -> None:
     bench = Bench()
     bench.port.request(Command(verb=Verb.TAKEOFF, value=3.1))
-    bench.run(0.1)
-    results = bench.hear(param_value("MIS_TAKEOFF_ALT", 2.5))
-    assert [(r.command.verb, r.ok) for r in results] == [(Verb.PARAM_FLOAT, False), (Verb.TAKEOFF, False)]
+    for _ in range(4):
+        assert [m.get_type() for m in bench.run(0.5)] == ["PARAM_SET"]
+        assert bench.hear(param_value("MIS_TAKEOFF_ALT", 2.5)) == []
     assert bench.run(3.0) == []
+    results = [(r.command.verb, r.ok, r.text) for r in bench.port.results()]
+    why = "stays at 2.5"
+    assert results == [(Verb.PARAM_FLOAT, False, why), (Verb.TAKEOFF, False, f"MIS_TAKEOFF_ALT: {why}")]
+
+
+def test_an_answer_to_a_ground_station_does_not_end_the_setting_of_a_parameter() -> None:
+    """It asks for the list when it sees the vehicle, just when the agent sets parameters; old values are in it."""
+    bench = Bench()
+    setting = Command(verb=Verb.PARAM_INT, name="NAV_DLL_ACT", number=3)
+    bench.port.request(setting)
+    bench.run(0.1)
+    assert bench.hear(param_value("NAV_DLL_ACT", bytewise(0), 6)) == []
+    assert bench.hear(param_value("NAV_DLL_ACT", bytewise(3), 6)) == [CommandResult(setting, True, "set")]
+
+
+ASKED_IN_FLIGHT = frozenset((Verb.ARM, Verb.TAKEOFF, Verb.EXTERNAL))
+
+
+@pytest.mark.parametrize("verb", [Verb.ARM, Verb.EXTERNAL])
+def test_what_is_withdrawn_is_not_repeated_and_its_answer_is_waited_for(verb: Verb) -> None:
+    bench = Bench()
+    bench.port.request(Command(verb=verb))
+    bench.port.request(Command(verb=Verb.LAND))
+    assert len(bench.run(0.1)) == 1
+    bench.port.withdraw(ASKED_IN_FLIGHT)
+    assert bench.run(0.38) == [], "the vehicle may obey what it has got"
+    assert bench.port.busy
+    assert [m.command for m in bench.run(0.1)] == [21]
+    assert [(r.command.verb, r.ok, r.text) for r in bench.port.results()] == [(verb, False, "no answer")]
+
+
+def test_negative_control_what_is_not_withdrawn_is_repeated() -> None:
+    bench = Bench()
+    bench.port.request(Command(verb=Verb.ARM))
+    bench.run(0.1)
+    bench.port.withdraw(frozenset((Verb.TAKEOFF,)))
+    assert [m.command for m in bench.run(2.0)] == [400, 400, 400]
+
+
+def test_the_rest_of_a_withdrawn_request_is_not_sent() -> None:
+    """PX4 is told the height of a take-off by a parameter first; a stop may come in between."""
+    bench = Bench()
+    bench.port.request(Command(verb=Verb.TAKEOFF, value=3.1))
+    assert [m.get_type() for m in bench.run(0.1)] == ["PARAM_SET"]
+    bench.port.withdraw(ASKED_IN_FLIGHT)
+    height = next(step for step in PX4.steps(Command(verb=Verb.TAKEOFF, value=3.1)) if step.name)
+    (result,) = bench.hear(param_value("MIS_TAKEOFF_ALT", struct.unpack("<f", struct.pack("<f", height.value))[0]))
+    assert result.ok
+    assert bench.run(3.0) == []
+    assert not bench.port.busy
+
+
+def test_what_waits_in_the_queue_and_is_withdrawn_is_never_sent() -> None:
+    bench = Bench()
+    bench.port.request(Command(verb=Verb.ARM))
+    bench.port.withdraw(ASKED_IN_FLIGHT)
+    assert bench.run(3.0) == []
+    assert not bench.port.busy
+
+
+def test_the_answer_to_a_repetition_acknowledges_no_other_command() -> None:
+    bench = Bench()
+    first, second = (Command(verb=Verb.RATE, value=5.0, number=n) for n in (245, 24))
+    bench.port.request(first)
+    bench.port.request(second)
+    assert len(bench.run(0.6)) == 2, "the round trip is longer than half a second"
+    assert bench.hear(ack(511)) == [CommandResult(first, True, "accepted")]
+    assert len(bench.run(0.1)) == 1
+    assert bench.hear(ack(511)) == [], "the second one for the first command"
+    assert bench.hear(ack(511)) == [CommandResult(second, True, "accepted")]
+
+
+def test_an_answer_that_was_lost_makes_one_command_be_repeated_and_not_all_that_follow() -> None:
+    bench = Bench()
+    rates = [Command(verb=Verb.RATE, value=5.0, number=n) for n in (245, 24, 1, 2)]
+    for rate in rates:
+        bench.port.request(rate)
+    bench.run(0.6)  # asked twice, answered once
+    assert bench.hear(ack(511)) == [CommandResult(rates[0], True, "accepted")]
+    bench.run(0.1)
+    assert bench.hear(ack(511)) == []
+    assert len(bench.run(0.6)) == 1
+    assert bench.hear(ack(511)) == [CommandResult(rates[1], True, "accepted")]
+    for rate in rates[2:]:
+        bench.run(0.1)
+        assert bench.hear(ack(511)) == [CommandResult(rate, True, "accepted")]
+
+
+def test_an_answer_before_the_command_was_sent_is_none() -> None:
+    bench = Bench()
+    first, second = (Command(verb=Verb.RATE, value=5.0, number=n) for n in (245, 24))
+    bench.port.request(first)
+    bench.port.request(second)
+    bench.run(0.1)
+    assert bench.hear(ack(511)) == [CommandResult(first, True, "accepted")]
+    assert bench.hear(ack(511)) == []
 
 
 def test_arducopter_takes_off_with_the_height_in_the_command() -> None:

@@ -273,7 +273,7 @@ def test_a_parameter_that_could_not_be_set_back_is_named_with_its_value() -> Non
     vehicle = Vehicle(NAV_DLL_ACT=0).set_up(NAV_DLL_ACT=3).run(4.0)
     vehicle.read_only = True
     vehicle.vehicle_setup.restore(vehicle.clock.now_us())
-    vehicle.run(3.0)
+    vehicle.run(6.0)
     assert (vehicle.vehicle_setup.restored, vehicle.vehicle_setup.left_changed) == (True, {"NAV_DLL_ACT": 0})
 
 

@@ -7,7 +7,7 @@ import math
 from swarmctl.control.phases import handover
 from swarmctl.control.phases.departure import SPIN_UP_US, obstacle_coming, unmet_climb_condition
 from swarmctl.control.phases.inputs import PhaseInputs
-from swarmctl.control.phases.mission_state import MissionState
+from swarmctl.control.phases.mission_state import DISARMED, MissionState
 from swarmctl.control.phases.trajectories import is_at
 from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
@@ -24,7 +24,7 @@ def takeoff(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
         return []
     if not state.armed:  # pilot or autopilot disarmed it: it is not armed again
         if mission.arming.is_disarmed(inputs, state):
-            mission.give_up("disarmed before take-off", inputs, state)
+            mission.give_up(DISARMED, inputs, state)
         return []
     others = handover.is_under_other_control(state)
     mission.climb.was_ours |= not others

@@ -60,7 +60,7 @@ def land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> lis
             mission.enter(Phase.DONE, inputs.now_us)
             return []
         return [Command(verb=Verb.HOLD)] if mission.may_request(inputs) else []
-    if mission.is_down(inputs, state) or mission.arming.disarmed_for_us(inputs.now_us) >= _MOTIONLESS_US:
+    if mission.is_down(inputs, state) or mission.arming.disarmed_for_us >= _MOTIONLESS_US:
         mission.enter(Phase.DONE, inputs.now_us)
         return []
     if state.mode is FlightMode.LAND:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from swarmctl.control.phases import handover
 from swarmctl.control.phases.departure import unmet_climb_condition, unmet_start_condition
 from swarmctl.control.phases.inputs import PhaseInputs
-from swarmctl.control.phases.mission_state import TAKEN_OVER, MissionState
+from swarmctl.control.phases.mission_state import DISARMED, TAKEN_OVER, MissionState
 from swarmctl.core.types import Command, FlightMode, Landed, Phase, VehicleState, Verb
 
 
@@ -45,6 +45,10 @@ def arm(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list
         return []
     if state.armed:
         mission.enter(Phase.GOTO_START if mission.airborne else Phase.TAKEOFF, inputs.now_us)
+        return []
+    if mission.arming.accepted:  # its motors turn, unless a pilot has stopped them since: it is not armed again
+        if mission.arming.disarmed_for_us:
+            mission.give_up(DISARMED, inputs, state)
         return []
     too_late = "" if mission.airborne else _too_late(peer.phase for peer in inputs.peers().values())
     if refusal := inputs.refusal or too_late:
