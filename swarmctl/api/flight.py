@@ -23,7 +23,7 @@ from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.errors import ConfigError, MissionError, StartError
 from swarmctl.files import read_file
 from swarmctl.ops.orders.mission_file import set_mission
-from swarmctl.ops.orders.operator import read_statuses
+from swarmctl.ops.orders.operator import read_agents, read_statuses
 from swarmctl.ops.orders.order_delivery import Reply, deliver
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
 from swarmctl.telemetry.recording.file_names import CONFIG
@@ -72,7 +72,11 @@ def launch(config: Config | None = None, folder: str | Path | None = None, *, vi
     shown = "--view" if view else "--no-view"
     arguments = ("swarmctl", "launch", str(directory / CONFIG), f"--run-dir={directory}", shown)
     swarm = Swarm(flown, directory, FlightProcess("launch", directory, *arguments))
-    swarm.wait_for_start()
+    try:
+        swarm.wait_for_start()
+    except BaseException:  # Ctrl-C reaches the script alone, and nobody would have the swarm
+        swarm.__exit__(None, None, None)
+        raise
     return swarm
 
 
@@ -200,7 +204,7 @@ class Swarm:
         return found
 
     def wait_for(self, phase: str, timeout_s: float = 120.0) -> None:
-        """Wait until every agent has reached a phase, for example "TRACK", or a later one.
+        """Wait until every agent has reached a phase, for example "TRACK", or a later one, as who has landed and ended.
 
         Raises:
             ConfigError: there is no such phase.
@@ -211,7 +215,10 @@ class Swarm:
             raise ConfigError("wait_for", [f"{phase!r} is no phase; those are {', '.join(Phase.__members__)}"])
         wanted, until_s = Phase[phase], time.monotonic() + timeout_s
         while True:
-            phases = {agent: status["phase"] for agent, status in self.status().items()}
+            self._refuse_ended("wait_for")
+            statuses, gone = read_agents(self._note())
+            phases = dict.fromkeys(gone, Phase.DONE.name)
+            phases |= {agent: Phase(status.phase).name for agent, status in statuses.items()}
             if len(phases) == self.config.swarm.agents and all(Phase[name] >= wanted for name in phases.values()):
                 return
             if time.monotonic() > until_s:

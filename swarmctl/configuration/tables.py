@@ -52,7 +52,10 @@ def _table(path: Path) -> tuple[dict[str, Any], str]:
         return {}, f"can't be read: {error.strerror}"
     except UnicodeDecodeError:
         return {}, "can't be read: it is not UTF-8 text"
-    lines = [(number, _cells(row)) for number, row in enumerate(csv.reader(text.splitlines()), 1)]
+    try:
+        lines = [(number, _cells(row)) for number, row in enumerate(csv.reader(text.splitlines()), 1)]
+    except csv.Error as error:
+        return {}, f"can't be read as CSV: {error}"
     lines = [(number, cells) for number, cells in lines if cells and not cells[0].startswith("#")]
     if not lines:
         return {}, "is empty; its first line names the columns, for example t,x,y,z"

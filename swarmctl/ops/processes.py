@@ -217,7 +217,7 @@ class Child:
 
     def is_stopped(self) -> bool:
         """Return whether it is stopped by a signal or a debugger."""
-        with contextlib.suppress(psutil.Error):
+        with contextlib.suppress(psutil.Error, OSError):  # no descriptor may be left
             return bool(psutil.Process(self.pid).status() in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP))
         return False
 
@@ -226,7 +226,7 @@ class Child:
 
         The main thread of an agent ticks; recorder and bus go on in others where it hangs.
         """
-        with contextlib.suppress(psutil.Error):
+        with contextlib.suppress(psutil.Error, OSError):
             process = psutil.Process(self.pid)
             if process.status() == psutil.STATUS_TRACING_STOP:
                 return None
@@ -241,7 +241,12 @@ class Child:
             self.process.send_signal(signum)
 
     def kill_all(self) -> None:
-        """Send SIGKILL to every process of the child's session, also to orphans of it."""
+        """Send SIGKILL to every process of the child's session, also to orphans of it.
+
+        As long as there are orphans nobody else gets the child's number. Who has it after its end has another session.
+        """
+        if self.ended_s is not None and psutil.pid_exists(self.pid):
+            return
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
 

@@ -53,7 +53,8 @@ def announce(launch: RunningLaunch) -> None:
     """Write the notes of a launch; on a full disk the operator's verbs are lost, but not the flight."""
     payload = msgspec.json.encode(launch)
     notes = [Path(launch.run_dir) / LAUNCH_FILE]
-    notes += [place / f"{launch.pid}.json" for place in (_runtime_registry(), _temporary_registry()) if place]
+    with contextlib.suppress(OSError):  # without a descriptor left no folder can be listed
+        notes += [place / f"{launch.pid}.json" for place in (_runtime_registry(), _temporary_registry()) if place]
     for note in notes:
         with contextlib.suppress(OSError):
             replace_bytes(note, payload)
@@ -85,7 +86,7 @@ def find_launch(run: str | None) -> RunningLaunch:
         StartError: there is none, or it is ending.
         ConfigError: there are several, and none of them is chosen.
     """
-    if run is not None and (Path(run) / LAUNCH_FILE).exists():
+    if run is not None and _has_note(Path(run)):
         launch = launch_in(Path(run))
         if launch is None:
             raise StartError(f"--run {run}: no launch runs there. See what does with: swarmctl status")
@@ -144,6 +145,14 @@ def refuse_ending(launch: RunningLaunch) -> None:
     _flying(_read(Path(launch.run_dir) / LAUNCH_FILE) or launch)
 
 
+def _has_note(directory: Path) -> bool:
+    """Return whether this is the folder of a launch; not if it may not be looked into, or its name is too long."""
+    try:
+        return (directory / LAUNCH_FILE).exists()
+    except OSError:
+        return False
+
+
 def _flying(launch: RunningLaunch) -> RunningLaunch:
     """Return a launch as it is.
 
@@ -159,7 +168,8 @@ def _registries() -> list[Path]:
     """Return the private directories of this user that may hold notes."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     places = [Path(runtime) / "swarmctl"] if runtime and _is_private(Path(runtime)) else []
-    places += sorted(_temporary_folder().glob(f"{_temporary_name()}*"))
+    for folder in _temporary_folders():
+        places += sorted(folder.glob(f"{_temporary_name()}*"))
     return [place for place in places if _is_private(place)]
 
 
@@ -176,7 +186,10 @@ def _runtime_registry() -> Path | None:
 
 def _temporary_registry() -> Path | None:
     """Return a private registry among temporary files; with a random name if another user has taken the usual one."""
-    plain = _temporary_folder() / _temporary_name()
+    try:
+        plain = Path(tempfile.gettempdir()) / _temporary_name()
+    except OSError:  # no disk takes a file
+        return None
     with contextlib.suppress(OSError):
         plain.mkdir(mode=0o700, exist_ok=True)
     for place in (plain, *sorted(plain.parent.glob(f"{plain.name}-*"))):
@@ -187,8 +200,13 @@ def _temporary_registry() -> Path | None:
     return None
 
 
-def _temporary_folder() -> Path:
-    return Path(tempfile.gettempdir())
+def _temporary_folders() -> list[Path]:
+    """Return where launches may have left notes: to find the one that flies, no disk has to take a file."""
+    try:
+        return [Path(tempfile.gettempdir())]
+    except OSError:
+        named = (os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))
+        return list(dict.fromkeys(Path(folder) for folder in (*named, "/tmp", "/var/tmp") if folder))
 
 
 def _temporary_name() -> str:

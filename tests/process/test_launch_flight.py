@@ -347,6 +347,38 @@ def test_agents_whose_clock_is_an_hour_behind_are_ordered_to_land_by_their_own(t
     assert set(verbs) == {"land"}
 
 
+def test_an_interrupt_leaves_a_recovery_the_time_that_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C is what an operator does who reads that an agent was lost."""
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_LAND_S", 1.0)
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG])
+    scene.lands = ends(130, 3.0)
+
+    def kill_then_interrupt() -> None:
+        scene.kill(agent_name(0))
+        scene.act = lambda: setattr(scene, "interrupts", 1) if scene.recovered else None
+
+    scene.act = kill_then_interrupt
+    result = scene.fly()
+    assert scene.recovered == [0]
+    assert scene.children[agent_name(0)].poll() == 130, "it has landed the vehicle"
+    assert result.left == ()
+
+
+def test_a_second_interrupt_names_the_vehicle_of_an_agent_that_has_just_ended(tmp_path: Path) -> None:
+    vehicles = ",".join(f'{{url="udpin://127.0.0.1:{14540 + i}",sysid={1 + i}}}' for i in (0, 1))
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG])
+
+    def kill_unseen() -> None:
+        scene.kill(agent_name(0))
+        while scene.children[agent_name(0)].poll() is None:
+            time.sleep(0.01)
+        scene.interrupts = 2
+
+    scene.act = kill_unseen
+    result = scene.fly("sitl.enabled=false", f"vehicles=[{vehicles}]")
+    assert [words.split(" (")[0] for words in result.left] == ["vehicle 1", "vehicle 2"]
+
+
 def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
     scene.obeys = False

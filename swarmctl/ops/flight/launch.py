@@ -320,6 +320,10 @@ class Launcher(Services):
 
     def announce(self, view: str) -> None:
         """Publish this launch to the operator's commands."""
+        if self._announced is not None:  # nothing else has changed, and there may be no descriptor left to ask again
+            self._announced = msgspec.structs.replace(self._announced, view=view)
+            announce(self._announced)
+            return
         context = self.context
         start_s, pid = process_start_s()
         self._announced = RunningLaunch(

@@ -76,17 +76,17 @@ def as_json(run: str, fault: FaultParams, since_boot_s: float) -> str:
 
 def _ask(path: Path, request: dict[str, Any]) -> dict[str, Any]:
     """Send one request and return its answer, over a socket in a private folder."""
-    with (
-        tempfile.TemporaryDirectory(prefix="swarm-") as folder,
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock,
-    ):
-        sock.bind(f"{folder}/{os.getpid()}.sock")
-        sock.settimeout(_ANSWER_S)
-        try:
+    try:
+        with (
+            tempfile.TemporaryDirectory(prefix="swarm-") as folder,
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock,
+        ):
+            sock.bind(f"{folder}/{os.getpid()}.sock")
+            sock.settimeout(_ANSWER_S)
             sock.sendto(json.dumps(request).encode(), str(path))
             answer = json.loads(sock.recv(_LARGEST))
-        except (OSError, ValueError) as error:
-            raise StartError(f"fault: the simulator does not answer ({error}); see: swarmctl status") from error
+    except (OSError, ValueError) as error:
+        raise StartError(f"fault: the simulator does not answer ({error}); see: swarmctl status") from error
     return answer if isinstance(answer, dict) else {}
 
 

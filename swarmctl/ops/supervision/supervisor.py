@@ -29,7 +29,7 @@ from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.supervision.own_pause import OwnPause
-from swarmctl.ops.supervision.recovery import RECOVERY_S, Recovery, handed_over, is_done
+from swarmctl.ops.supervision.recovery import Recovery, handed_over, is_done
 from swarmctl.ops.supervision.standstill import Standstill
 from swarmctl.ops.supervision.status_table import AgentView, Display, name_of, tell
 from swarmctl.ops.supervision.viewer_watch import ViewerWatch
@@ -150,15 +150,21 @@ class FlightSupervisor:
 
     def _kill_everything(self) -> None:
         """Kill every process; agents first, so that those of other computers are told of their ends."""
-        running = self._running()
+        running, children = self._running(), self._services.children
+        ended = {
+            view.agent: (view, code)  # since the agents were watched
+            for view, child in zip(self._views, self._agents(), strict=True)
+            if (code := child.poll()) is not None and self._is_first(_end_of(child))
+        }
         if len(self._views) < self._config.swarm.agents:
-            kill_all([self._services.children[agent_name(view.agent)] for view in running])
-            for view in running:
-                self._vouch_for_end(view, 128 + signal.SIGKILL)
+            kill_all([children[agent_name(view.agent)] for view in running])
+            for view, code in (*ended.values(), *((view, 128 + signal.SIGKILL) for view in running)):
+                self._vouch_for_end(view, code)
             time.sleep(_TOLD_S)
-        kill_all(list(self._services.children.values()))
+        kill_all(list(children.values()))
         if not self._config.sitl.enabled:
-            self._recovery.give_up(running)
+            left = [view for view, code in ended.values() if not self._recovery.leaves_down(view, code)]
+            self._recovery.give_up([*running, *left])
 
     def _report_left_vehicles(self) -> LaunchResult:
         """Report every vehicle that is not known to be on the ground, and the parameters that were not set back."""
@@ -183,7 +189,8 @@ class FlightSupervisor:
             if waits or status.phase in _TIMED:  # a mission, also one that an operator has set, or a long way back
                 left_s = self._config.mission.duration_s if waits else status.ends_in_s
                 self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + left_s)
-            self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
+            may_be_armed = status.phase < Phase.GOTO_LAND or status.armed  # a stop on the ground passes LAND, too
+            self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE and may_be_armed
         adopted = self._obstacles.receive()
         for adoption in adopted:
             text = f"{counted(len(adoption.after.obstacles), 'obstacle')}, set by an operator"
@@ -257,8 +264,6 @@ class FlightSupervisor:
         self._announce(
             "recovering", f"landing the vehicle of {agent_name(view.agent)}, which may be armed or in the air"
         )
-        if self._land_ordered_s is not None:
-            self._land_until_s = max(self._land_until_s, time.monotonic() + RECOVERY_S)
 
     def _check_responsive(self, view: AgentView, child: Child, now_s: float) -> None:
         waited_s = now_s - self._started_s
@@ -329,7 +334,8 @@ class FlightSupervisor:
         if any(_end_of(child) not in self._reported for child in self._agents() if child.poll() is not None):
             return False  # it has ended since the agents were watched, and may say how the flight went
         if self._land_ordered_s is not None and now_s > self._land_until_s:
-            self._end_late(running)
+            recovered = () if self._vehicles_lost else [v for v in running if self._recovery.is_on(v.agent)]
+            self._end_late([view for view in running if view not in recovered])  # those have times of their own
             return not running
         if not running:
             deaths_s = [

@@ -100,8 +100,12 @@ def deadlock_counts(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Count deadlocks, those that were not resolved, and the longest duration."""
     noticed = [event for event in events if event.get("event") == "deadlock"]
     lasted_s = [seconds for event in noticed if (seconds := finite(event.get("lasted_s"))) is not None]
-    begun = sum(event.get("begins") is True for event in noticed)
-    return {"count": begun, "longest_s": max(lasted_s, default=None), "unresolved": begun - len(lasted_s)}
+    count, unresolved = 0, Counter[str]()
+    for event in noticed:  # the begin of one may not be recorded: by a station that came later, or on a full disk
+        source, begins = str(event.get("source")), event.get("begins") is True
+        count += begins or not unresolved[source]
+        unresolved[source] = max(0, unresolved[source] + (1 if begins else -1))
+    return {"count": count, "longest_s": max(lasted_s, default=None), "unresolved": unresolved.total()}
 
 
 def commitment_counts(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:

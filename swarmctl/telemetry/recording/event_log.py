@@ -20,5 +20,8 @@ class EventLog:
     def write(self, event: str, **fields: Any) -> None:
         """Append one row with both clocks."""
         stamp = {"utc_us": self._utc_us(), "t_us": monotonic_us(), "source": self._source, "event": event}
-        with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({**stamp, **fields}) + "\n")
+        line = json.dumps({**stamp, **fields}).encode() + b"\n"
+        with contextlib.suppress(OSError), self._path.open("ab", buffering=0) as file:
+            size = file.tell()
+            if file.write(line) < len(line):  # the disk is full: the next event begins a line of its own
+                file.truncate(size)

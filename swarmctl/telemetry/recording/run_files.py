@@ -166,7 +166,8 @@ def _event(line: bytes) -> dict[str, Any] | None:
         row = json.loads(line.decode("utf-8", errors="replace"))
     except (ValueError, RecursionError):
         return None
-    return _printable(row) if isinstance(row, dict) and _is_sane(row) else None
+    is_event = isinstance(row, dict) and isinstance(row.get("source", ""), str)
+    return _printable(row) if is_event and _is_sane(row) else None
 
 
 def _printable(value: Any) -> Any:

@@ -8,6 +8,7 @@ import msgspec
 
 Outcome = Literal["completed", "failed", "interrupted"]
 _Figure = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]  # range that can be printed and drawn
+_Square = Annotated[float, msgspec.Meta(ge=0.0, le=1e18)]  # of a figure
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
 
 
@@ -19,7 +20,7 @@ class _Percentiles(msgspec.Struct):
 
 class _Tracked(msgspec.Struct):
     id: Annotated[int, msgspec.Meta(ge=0, lt=1000)]
-    mse_m2: list[_Figure | None]
+    mse_m2: list[_Square | None]
     mean_distance_m: _Figure | None = None
     rmse_m: _Figure | None = None
     steady_rmse_m: _Figure | None = None

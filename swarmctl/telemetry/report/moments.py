@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.json_safe import finite
 from swarmctl.core.operator_verbs import EXCLUDE, GOTO, MISSION, POINT
 from swarmctl.core.text import point_text
 from swarmctl.core.types import Array
@@ -66,7 +68,8 @@ def _words(event: Mapping[str, Any]) -> str:
     """Return an order in words; "" for what changes no flight."""
     verb = str(event.get("verb"))
     if verb == GOTO:
-        return f"goto {point_text(float(event.get(axis, np.nan)) for axis in POINT)}"
+        at_m = [finite(event.get(axis)) for axis in POINT]
+        return f"goto {point_text(math.nan if place_m is None else place_m for place_m in at_m)}"
     return {EXCLUDE: "", MISSION: "mission set"}.get(verb, verb)
 
 

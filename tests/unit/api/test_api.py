@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -17,12 +18,14 @@ import numpy as np
 import pytest
 
 import swarmctl
+from swarmctl.api import flight
 from swarmctl.api.flight import Swarm, _numbers
 from swarmctl.api.flight_process import FlightProcess
-from swarmctl.config import Config, dump
+from swarmctl.config import Config, dump, load
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
+from tests import builders
 from tests.unit.ops.test_cli import HEAVY
 from tests.unit.telemetry.test_hostile_run_folder import REFUSED
 
@@ -210,3 +213,31 @@ def test_phases_and_points_that_are_none_are_refused_in_words(tmp_path: Path) ->
         swarm.wait_for("track")
     with pytest.raises(ConfigError, match=r"point_ned_m = \(1, 2\): expected three numbers: north_m, east_m, down_m"):
         swarm.goto(0, (1, 2))
+
+
+def test_who_has_landed_and_ended_has_reached_every_phase(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    process: Any = SimpleNamespace(is_running=True)
+    swarm = Swarm(load(None, ["swarm.agents=2"]), tmp_path, process)
+    told = builders.status_message(agent=1, phase=int(Phase.LAND))
+    monkeypatch.setattr(Swarm, "_note", lambda _: None)
+    monkeypatch.setattr(flight, "read_agents", lambda _: ({1: told}, frozenset((0,))))
+    swarm.wait_for("LAND", 0.0)
+    with pytest.raises(TimeoutError, match="not all agents have reached DONE"):
+        swarm.wait_for("DONE", 0.0)
+
+
+def test_a_launch_that_is_interrupted_while_it_starts_is_landed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C reaches the script, and not the launch, which has a session of its own."""
+    asked = list[str]()
+
+    def interrupted(swarm: Swarm) -> None:
+        raise KeyboardInterrupt
+
+    process = SimpleNamespace(interrupt=lambda: asked.append("land"), wait=lambda: asked.append("wait"))
+    monkeypatch.setattr(flight, "FlightProcess", lambda *_: process)
+    monkeypatch.setattr(Swarm, "wait_for_start", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        flight.launch(Config(), tmp_path / "run")
+    assert asked == ["land", "wait"]

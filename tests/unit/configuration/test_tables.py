@@ -45,6 +45,7 @@ def test_a_file_is_found_beside_the_configuration_and_recorded_with_it(tmp_path:
         (b"t x y z\n0 0 0 -1\n", "separated by spaces"),
         (b"0.00,0,0,-1\n1.00,0,0,-1\n", "has to name the columns, for example t,x,y,z"),
         (b"\xff\xfe", "not UTF-8"),
+        (b't,x,y,z\n"' + b"1" * 140_000, "can't be read as CSV: field larger than field limit"),
         (b"t,x,y,z\n" + b"0,0,0,-1\n" * 200_000, "larger than 1 MB"),
         (b"time,x,y,z\n0,0,0,-1\n1,1,0,-1\n", "columns time,x,y,z"),
     ],

@@ -47,6 +47,17 @@ def test_a_process_whose_log_can_not_be_opened_runs_without_it(tmp_path: Path) -
     assert child.how_it_ended() == "ended with exit code 4"
 
 
+def test_who_has_got_the_number_of_a_process_that_ended_is_not_killed_in_its_place(tmp_path: Path) -> None:
+    child = Child(Command("x", (sys.executable, "-Sc", "")), tmp_path)
+    assert child.wait(60.0)
+    other = Child(Command("y", (sys.executable, "-Sc", "import time; time.sleep(60)")), tmp_path)
+    child.pid = other.pid
+    child.kill_all()
+    assert not other.wait(0.5)
+    other.kill_all()
+    assert other.wait(60.0), "its own number is its own"
+
+
 @pytest.mark.parametrize(
     ("agents", "most", "shares"),
     [

@@ -18,6 +18,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunData, evaluate
+from swarmctl.telemetry.evaluation.run_counts import deadlock_counts
 from swarmctl.telemetry.evaluation.tracks import merge_tracks, track_error, unseen_spans
 from swarmctl.telemetry.recording.summary_file import decode_summary
 from swarmctl.telemetry.report import run_report
@@ -594,6 +595,13 @@ def test_deadlocks_are_counted() -> None:
     )
     assert summary["deadlocks"] == {"count": 2, "longest_s": 2.5, "unresolved": 1}
     assert evaluate(run(APART), Rules(agents=2, required_separation_m=0.5), "completed")["deadlocks"]["count"] == 0
+
+
+def test_a_deadlock_whose_begin_was_not_recorded_leaves_none_unresolved() -> None:
+    """A station that comes later hears its end alone; -1 was a summary that nothing could read."""
+    ends = {"event": "deadlock", "begins": False, "lasted_s": 4.2}
+    events = [{"source": "agent-0", **ends}, {"source": "agent-1", "event": "deadlock", "begins": True}]
+    assert deadlock_counts(events) == {"count": 2, "longest_s": 4.2, "unresolved": 1}
 
 
 def test_a_mission_that_was_changed_in_flight_counts_with_its_own_duration() -> None:

@@ -32,6 +32,7 @@ from swarmctl.telemetry.report.charts import Line
 from swarmctl.telemetry.report.comparison import differences
 from swarmctl.telemetry.report.event_table import event_rows
 from swarmctl.telemetry.report.from_above import Place, top_view
+from swarmctl.telemetry.report.moments import _words
 from swarmctl.telemetry.report.run_charts import RunCharts
 from swarmctl.telemetry.report.run_report import summary_rows
 from swarmctl.telemetry.report.thinning import shape_of
@@ -436,3 +437,8 @@ def test_a_small_limit_of_deadline_misses_is_shown_as_it_is(limit_01: float, sho
     summary = evaluate(run({0: ticks(2, (0.0, 0.0, 0.0))}), rules, "completed")
     (row,) = [row for row in summary_rows(summary, rules) if row.name.startswith("deadline misses")]
     assert row.limit == shown
+
+
+@pytest.mark.parametrize("north", ["x", None, [1], float("nan")])
+def test_an_order_that_was_recorded_wrongly_is_shown_all_the_same(north: object) -> None:
+    assert _words({"verb": "goto", "north_m": north, "east_m": 1.0, "down_m": -2.0}).startswith("goto ")

@@ -54,6 +54,25 @@ def launch(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> RunningLaunch:
     return flies
 
 
+def test_a_launch_is_found_though_no_disk_takes_a_file(
+    launch: RunningLaunch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The recording may have filled the only one, and the vehicles are to be landed."""
+
+    def full() -> str:
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "gettempdir", full)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    assert find_launch(launch.run).run_dir == launch.run_dir
+    announce(launch)
+
+
+def test_a_folder_that_can_not_be_looked_into_is_none_of_a_launch(launch: RunningLaunch) -> None:
+    with pytest.raises(StartError, match="no launch runs there or has that name"):
+        find_launch("x" * 300)
+
+
 def end(launch: RunningLaunch) -> None:
     announce(msgspec.structs.replace(launch, ending=True))
 
