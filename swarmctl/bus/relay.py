@@ -146,7 +146,10 @@ def missed_by_peers(
         if has_heard_all and _heard_lately(message, rare_us if own in far else near_us):
             continue  # as nearly always
         heard = dict(message.heard.items())
+        excluded = message.exclusions.promised  # of these nothing counts any more, nor is it said what was heard
         for agent in newest.keys() - (far - heard.keys()) if far else newest:  # of far ones, those it mentions
+            if agent in excluded:
+                continue
             other, (stamp_us, arrival_us) = newest[agent], heard.get(agent, _NEVER)
             silent_us = message.sent_utc_us - arrival_us
             if silent_us <= near_us or other.sent_utc_us <= stamp_us or agent == peer or agent in found:

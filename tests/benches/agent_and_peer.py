@@ -40,9 +40,9 @@ class Bench:
 
     def __init__(self, far_hz: float = 0.0, peers: Sequence[int] = (1,)) -> None:
         self.clock, self.told = SimClock(), list[tuple[str, dict[str, Any]]]()
-        hub = LocalHub(self.clock.now_us, 1)
-        self.bus = hub.connect(agent_name(0))
-        self.peer: LocalBus = hub.connect(PEER)
+        self.hub = LocalHub(self.clock.now_us, 1)
+        self.bus = self.hub.connect(agent_name(0))
+        self.peer: LocalBus = self.hub.connect(PEER)
         self.alive = {agent_name(0), PEER}
         self.bus.alive = lambda: frozenset(self.alive)  # type: ignore[method-assign]
         separation, vehicle = SeparationParams(), VehicleModelParams()

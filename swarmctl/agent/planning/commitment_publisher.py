@@ -130,6 +130,8 @@ class CommitmentPublisher:
 
     def _frozen(self, heard: Mapping[int, tuple[int, int]], promised: Set[int]) -> Mapping[int, tuple[int, int]]:
         """Return the same, but nothing later of who is promised to be excluded: its lease has to end."""
+        if not self._far_us:
+            return heard  # nobody is far: there are no leases
         late = {agent: self._last_heard.setdefault(agent, heard[agent]) for agent in promised & heard.keys()}
         return {**heard, **late} if late else heard
 

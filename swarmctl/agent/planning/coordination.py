@@ -30,6 +30,7 @@ from swarmctl.core.types import MAX_MARGIN_M, Array, Phase, VehicleState
 
 _SUSPECT_US = 5_000_000  # without a message, after which a peer is suspected: bursts of loss end sooner
 _SILENT_US = 160_000  # four messages have not come, at the least
+_FAR_PERIODS = 2.5  # likewise of a peer of which this agent hears only what it tells those that are far
 _GAP_US = 1_000_000  # without a fresh state, after which nothing is committed any more
 _FASTER_01 = 1.1  # of the speed at which somebody else flies the vehicle, which may grow until the next message
 _SAME_M = 1e-3  # tubes that differ by less are equal: messages round
@@ -103,6 +104,7 @@ class Coordination:
         self._tube = Tube(self._tube_m)
         self._grip, self._error_m = Grip.HELD, 0.0
         self._entered_now, self._entered_ahead = Encounters(), Encounters()  # where a plan begins now, or ahead
+        self._far_silent_us = round(_FAR_PERIODS * 1e6 / far_hz) if far_hz else _SILENT_US
         self._clock_error_max_us = 1e6 * params.clock_error_max_s
         self._membership, self._deviations = Membership(agent, peers), Deviations()
         self._ended: frozenset[int] = frozenset()  # peers that take no part any more, by evidence
@@ -197,7 +199,7 @@ class Coordination:
             disturbance_ned_m_s2=disturbance_ned_m_s2,
         )
         commitments.evade(now)
-        self._evade_silent(now, relied_on)
+        self._evade_silent(replace(now, peers=known), relied_on)
         unsure = {a for a in required & near if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
         self.alert = self._why_slow(unsure)
         if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
@@ -386,13 +388,22 @@ class Coordination:
         )
 
     def _evade_silent(self, now: Situation, relied_on: Set[int]) -> None:
-        """Evade where vehicles of silent peers may be, or stop before the one of the only peer."""
-        near = self._far_peers.near - self._ended
+        """Evade where vehicles of silent peers may be, or stop before the one of the only peer.
+
+        Args:
+            now: its peers are all that are near: nothing is evaded to what conflicts with the proposal of any.
+            relied_on: those that fly as they have committed to.
+        """
+        everybody = self._peers - self._ended
+        near = self._far_peers.near & everybody
         silent = self._peer_trajectories.silent(near, now.utc_us, _SILENT_US)
         doubted = self._non_participants.without_setpoints(silent & relied_on, now.utc_us)
-        if doubted and most_are_heard(silent, near):
+        if not doubted:
+            return
+        silent |= self._peer_trajectories.silent(everybody - near, now.utc_us, self._far_silent_us)
+        if most_are_heard(silent, everybody):
             self._commitments.evade_doubted(now, doubted)
-        elif doubted and not self._membership.may_be_excluded:
+        elif not self._membership.may_be_excluded:
             self._commitments.stop_before(now, doubted, leaves=self._agent < min(self._peers))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from swarmctl.bus.relay import RelayingBus, decode_relay, encode_relay, missed_b
 from swarmctl.bus.topics import PATH, RELAY, TOO_LONG, TRAJECTORY
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import resting
-from swarmctl.core.trajectory_message import Reach, TrajectoryMessage
+from swarmctl.core.trajectory_message import Exclusions, Reach, TrajectoryMessage
 from tests import builders
 
 MESSAGES = [(2, b"second"), (0, b""), (7, bytes(range(256)))]
@@ -249,3 +250,40 @@ def test_who_helps_differs_from_agent_to_agent() -> None:
         )
     assert sum(counts) == 2 * (len(lost) - 1)
     assert max(counts) <= 5
+
+
+@pytest.mark.parametrize("frozen_s", [0.1, 2.0, 60.0])
+def test_nobody_passes_on_what_those_have_excluded_who_say_nothing_later_of_it(frozen_s: float) -> None:
+    """All hear it again, directly; its lease ends as they say so no more, and each took all others for deaf to it."""
+    agents, excluded, period_us, now_us = 6, 5, 20_000, 100_000_000
+    frozen_us, stamps_us = now_us - round(frozen_s * 1e6), [now_us - 1000 - period_us * i for i in range(64)]
+    heard = dict.fromkeys(range(agents), (now_us - period_us - 1000, now_us - period_us))
+    said = {**heard, excluded: (frozen_us - 1000, frozen_us)}
+    newest = {
+        agent: builders.trajectory_message(
+            agent=agent,
+            sent_utc_us=now_us - 1000,
+            committed=resting(np.zeros(3), 0, 100_000),
+            heard={a: t for a, t in (heard if agent == excluded else said).items() if a != agent},
+            exclusions=Exclusions(promised=frozenset() if agent == excluded else frozenset((excluded,))),
+        )
+        for agent in range(agents)
+    }
+
+    def relayed(own: int, peers: Mapping[int, TrajectoryMessage]) -> list[int]:
+        return missed_by_peers(
+            own,
+            peers,
+            peers,
+            dict.fromkeys(peers, now_us),
+            now_us,
+            peer_count=agents - 1,
+            period_us=period_us,
+            far_us=0,
+            lacked_us=lambda message, _, stamp_us: message.sent_utc_us - min(t for t in stamps_us if t > stamp_us),
+        )
+
+    others = [{a: message for a, message in newest.items() if a != own} for own in range(excluded)]
+    assert [relayed(own, peers) for own, peers in enumerate(others)] == [[]] * excluded
+    unsaid = {agent: replace(message, exclusions=Exclusions()) for agent, message in others[0].items()}
+    assert relayed(0, unsaid) == [excluded], "control: who has excluded nobody is helped"
