@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import pty
 import signal
+import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 import swarmctl.ops.supervision.recovery
 import swarmctl.ops.supervision.supervisor
@@ -28,8 +32,10 @@ from swarmctl.bus.traffic import CountedBus
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Landed, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
-from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child
+from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, kill_all
+from swarmctl.ops.supervision.background_display import BackgroundDisplay
 from swarmctl.ops.supervision.hearing import Hearing
+from swarmctl.ops.supervision.status_table import AgentView, Display, LiveTable
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 from swarmctl.telemetry.recording.event_log import EventLog
 from swarmctl.telemetry.recording.file_names import events_file
@@ -296,6 +302,47 @@ def test_an_agent_that_somebody_ends_before_its_first_status_did_not_start(tmp_p
     result = scene.fly()
     assert result.problems == ["agent-0 could not start: it was killed by SIGTERM"]
     assert result.exit_code(violated=False) == EXIT_START
+
+
+class OnTerminal(ScriptedServices):
+    """Also shown on a terminal of which nobody reads, as one that was stopped with Ctrl-S, or whose link has dropped.
+
+    Args:
+        wrapped: makes the display of the live table.
+    """
+
+    def __init__(self, directory: Path, agents: Sequence[str], wrapped: Callable[[Display], Display]) -> None:
+        super().__init__(directory, agents)
+        self.unread_fd, terminal_fd = pty.openpty()
+        stream = os.fdopen(terminal_fd, "w")
+        self.shown = wrapped(LiveTable(Console(file=stream, force_terminal=True, width=120, height=40)))
+
+    def show(self, agents: Sequence[AgentView]) -> None:
+        super().show(agents)
+        self.shown.print_line("x" * 2000)
+        self.shown.show(agents)
+
+
+def test_a_terminal_that_takes_nothing_holds_up_no_flight(tmp_path: Path) -> None:
+    scene = OnTerminal(tmp_path, [FLIES_LONG, ends(0, 4.0)], BackgroundDisplay)
+    scene.act = lambda: scene.kill("agent-0")
+    began_s = time.monotonic()
+    assert scene.fly().outcome == "failed"
+    assert scene.recovered == [0]
+    assert time.monotonic() - began_s < 20.0
+
+
+def test_negative_control_without_a_thread_of_its_own_it_does(tmp_path: Path) -> None:
+    scene = OnTerminal(tmp_path, [FLIES_LONG, ends(0, 4.0)], lambda display: display)
+    flight = threading.Thread(target=scene.fly, daemon=True)
+    flight.start()
+    flight.join(10.0)
+    assert flight.is_alive()
+    kill_all(list(scene.children.values()))
+    os.set_blocking(scene.unread_fd, False)
+    while flight.is_alive():  # until all is read
+        with contextlib.suppress(BlockingIOError):
+            os.read(scene.unread_fd, 65_536)
 
 
 def test_first_interrupt_lands_all_agents(tmp_path: Path) -> None:

@@ -49,8 +49,9 @@ from swarmctl.ops.processes import (
 )
 from swarmctl.ops.running_launches import RunningLaunch, announce, process_start_s, withdraw
 from swarmctl.ops.shared_children import start_agents
+from swarmctl.ops.supervision.background_display import BackgroundDisplay
 from swarmctl.ops.supervision.launch_result import LaunchResult
-from swarmctl.ops.supervision.status_table import open_display, tell
+from swarmctl.ops.supervision.status_table import Display, open_display, tell
 from swarmctl.ops.supervision.supervisor import FlightSupervisor, Services
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.process_priority import is_realtime_permitted
@@ -195,7 +196,7 @@ class Launcher(Services):
         self._config = config
         self._options = options
         self._reserved = reserved
-        self.display = open_display(run=part.run)
+        self.display: Display = BackgroundDisplay(open_display(run=part.run))
         identity = None if part.links is None else part.links.identity
         self.context = RunContext(
             part.run,

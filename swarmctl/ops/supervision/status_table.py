@@ -209,7 +209,7 @@ def _alert_lines(agents: Sequence[AgentView], width: int, room: int | None) -> l
     alerts = [(view.agent, view.alert) for view in agents if view.alert]
     lines: list[str] = []
     for shown, (agent, alert) in enumerate(alerts):
-        more = textwrap.wrap(f"{agent:>2}: {alert}", width, subsequent_indent="    ")
+        more = textwrap.wrap(f"{agent:>2}: {alert}", max(8, width), subsequent_indent="    ")
         if room is not None and len(lines) + len(more) > room - (shown < len(alerts) - 1):
             return [*lines, f"{len(alerts) - shown} more alerts: swarmctl status"]
         lines += more
