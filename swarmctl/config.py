@@ -20,7 +20,7 @@ from swarmctl.configuration.constraints import address_problems, obstacle_proble
 from swarmctl.configuration.obstacles import read_obstacles
 from swarmctl.configuration.problems import validated
 from swarmctl.configuration.shows import read_show
-from swarmctl.configuration.source import override, read_tree, set_value
+from swarmctl.configuration.source import filled_in, forget_other_files, override, read_tree, set_value
 from swarmctl.configuration.tables import read_tables
 from swarmctl.configuration.tree import Config
 from swarmctl.control.reference.mission import MissionParams
@@ -66,8 +66,10 @@ def load(
     source = str(path) if path else "defaults"
     tree, folder = read_tree(path), Path.cwd() if path is None else path.parent
     read_obstacles(tree, folder)  # so that overrides may change one; what is wrong is said below
+    was_filled_in = filled_in(tree)
     problems = [p for item in overrides for p in override(tree, item)]
     problems += [p for key, value in values.items() for p in set_value(tree, key, value)]
+    forget_other_files(tree, was_filled_in)
     problems += read_tables(tree, folder) + read_show(tree, folder) + read_obstacles(tree, folder)
     locate(tree, folder)
     locate_keys(tree, folder)

@@ -6,9 +6,10 @@ integers of 64 bits, as in TOML.
 
 from __future__ import annotations
 
+import copy
 import itertools
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,37 @@ _MAX_DEPTH = 12  # nesting of sections and lists; a configuration needs 5
 _INT64 = range(-(2**63), 2**63)
 _MAX_SHOWN = 80
 _MAX_INDEX_DIGITS = 6  # digits
+_FILLED_IN = (("csv", "files", "tables"), ("skybrush", "file", "trajectories"))  # of [mission]: names, and what is read
 _NO_FILE = "no such file. Give the path of a TOML file; swarmctl config init NAME writes one to begin with"
+
+
+def filled_in(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the names of the files whose contents a resolved configuration holds, by section of the mission."""
+    found = {}
+    for section, names, contents in _FILLED_IN:
+        keys = _keys_of(tree, section)
+        if contents in keys:
+            found[section] = (copy.deepcopy(keys.get(names)), keys[contents])
+    return found
+
+
+def forget_other_files(tree: Mapping[str, Any], before: Mapping[str, Any]) -> None:
+    """Remove what was read from files of which others have been named since: these are read in their place.
+
+    Args:
+        tree: the plain tree, with what has been set in it.
+        before: as `filled_in` has returned of it before that.
+    """
+    for section, names, contents in _FILLED_IN:
+        keys = _keys_of(tree, section)
+        if section in before and keys.get(names) != before[section][0] and keys.get(contents) is before[section][1]:
+            del keys[contents]
+
+
+def _keys_of(tree: Mapping[str, Any], section: str) -> dict[str, Any]:
+    mission = tree.get("mission")
+    keys = mission.get(section) if isinstance(mission, dict) else None
+    return keys if isinstance(keys, dict) else {}
 
 
 def read_tree(path: Path | None) -> dict[str, Any]:

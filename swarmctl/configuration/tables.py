@@ -15,6 +15,7 @@ from swarmctl.core.text import printable
 from swarmctl.files import read_file
 
 _MAX_BYTES = 1_000_000  # of one file
+_MOST_FILLED_IN = 3_500_000  # characters of all, of the 4 MB that a resolved configuration may have
 _MAX_SHOWN = 80
 _OTHER_MARKS = {";": "semicolons", "\t": "tabs", " ": "spaces"}  # between values, of files that have no commas
 
@@ -38,6 +39,11 @@ def read_tables(tree: dict[str, Any], folder: Path) -> list[str]:
         table, problem = _table(folder / name)
         tables.append(table)
         problems += [f"mission.csv.files: {printable(name, _MAX_SHOWN)}: {problem}"] if problem else []
+    rows = (row for table in tables for row in table.get("rows", ()))
+    filled_in = sum(len(repr(number)) + 2 for row in rows for number in row)
+    if filled_in > _MOST_FILLED_IN:
+        has = f"hold {filled_in / 1e6:.1f} MB of numbers together; allowed: {_MOST_FILLED_IN / 1e6:g} MB"
+        problems.append(f"mission.csv.files: {has}. Leave out digits, or rows: what is between them is interpolated")
     section["tables"] = tables
     return problems
 

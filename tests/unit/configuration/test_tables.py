@@ -60,3 +60,27 @@ def test_a_file_that_is_no_table_is_refused(tmp_path: Path, content: bytes, word
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no such file .*b\.csv"):
         load(config_with(tmp_path, GOOD.encode()), ["mission.csv.files=['b.csv']"])
+
+
+def test_another_file_that_is_set_on_a_resolved_configuration_is_flown(tmp_path: Path) -> None:
+    """What was read from the former one is in it, and was flown in its place without a word."""
+    flown = load(config_with(tmp_path, b"t,x,y,z\n0,0,0,-1\n9,1,0,-1\n"))
+    resolved, other = tmp_path / "config.toml", tmp_path / "b.csv"
+    resolved.write_text(dump(flown), encoding="utf-8")
+    other.write_bytes(b"t,x,y,z\n0,0,0,-2\n9,5,0,-2\n")
+    assert load(resolved).mission == flown.mission
+    changed = load(resolved, ["mission.csv.files=['b.csv']"])
+    assert "[9.0, 5.0, 0.0, -2.0]" in dump(changed) and "[9.0, 1.0, 0.0, -1.0]" not in dump(changed)
+    with pytest.raises(ConfigError, match="no such file"):
+        load(resolved, ["mission.csv.files=['none.csv']"])
+
+
+def test_files_that_are_more_together_than_can_be_recorded_are_refused(tmp_path: Path) -> None:
+    row = b",".join([b"0.123456789012345"] * 6)
+    content = b"t,x,y,z,vx,vy,vz\n" + b"".join(b"%d.0,%s\n" % (k, row) for k in range(8000))
+    path = config_with(tmp_path, content)
+    path.write_text(
+        path.read_text().replace('["a.csv"]', '["a.csv", "a.csv", "a.csv", "a.csv", "a.csv"]'), encoding="utf-8"
+    )
+    with pytest.raises(ConfigError, match="MB of numbers together; allowed"):
+        load(path)
