@@ -25,7 +25,7 @@ from swarmctl.check.scan.link_facts import VehicleFacts
 from swarmctl.check.scan.scanner import run_scans
 from swarmctl.config import Config, load_recorded
 from swarmctl.configuration.sections import MavlinkParams
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replaced
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.ops.vehicles.vehicle_links import open_links
@@ -68,6 +68,8 @@ def bundle(options: BundleOptions) -> Bundle:
     config, folder = load_recorded(options.folder), options.folder.resolve()
     output = options.output or folder.with_name(f"{folder.name}.zip")
     refuse_as_output(output, folder, ".zip")
+    if not output.resolve().parent.is_dir():  # before logs are downloaded, which takes minutes
+        raise ConfigError("--output", [f"{output}: its folder does not exist; make it first"])
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)
     try:
         with ended_cleanly, tempfile.TemporaryDirectory(prefix="swarm-bundle-") as scratch:
@@ -103,6 +105,8 @@ def _add(archive: zipfile.ZipFile, path: Path, name: Path) -> None:
     except FileNotFoundError as error:
         text = f"{path}: has vanished, as the run is being packed. Repeat the command once it is finished"
         raise StartError(text) from error
+    except UnicodeEncodeError as error:
+        raise StartError(f"{str(path)!a}: its name is not UTF-8, and can't be in an archive; rename it") from error
 
 
 def lines_of(bundled: Bundle) -> list[str]:

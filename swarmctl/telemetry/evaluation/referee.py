@@ -113,7 +113,7 @@ def evaluate(
     run, known = replace(run, ticks=clocked.ticks, events=clocked.events(run.events)), clocked.known
     tracks = merge_tracks(known, run.truth, rules.agents)
     clock = _MissionClock(known, tracks)
-    without = _flown_without(run.events)
+    without = flown_without(run.events)
     here = [agent for agent in _agents_here(run, rules) if agent not in without]
     flew = outcome == "completed" or _has_armed(run)
     separation, apart = _evaluate_separation(tracks, rules, here if flew else (), clock)
@@ -193,7 +193,7 @@ def _has_armed(run: RunData) -> bool:
     return bool(run.truth["armed"].any()) or any(rows["armed"].any() for rows in run.ticks.values())
 
 
-def _flown_without(events: Sequence[Mapping[str, Any]]) -> frozenset[int]:
+def flown_without(events: Sequence[Mapping[str, Any]]) -> frozenset[int]:
     """Return the agents without which the others went on before they had flown."""
     told = (event.get("agents") for event in events if event.get("event") == "flown_without")
     return frozenset(agent for agents in told if isinstance(agents, list) for agent in agents if isinstance(agent, int))

@@ -22,7 +22,7 @@ from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import hold, is_held, replace_bytes, replace_text, write_each
-from swarmctl.telemetry.evaluation.referee import Rules, RunData, RunMode, evaluate
+from swarmctl.telemetry.evaluation.referee import Rules, RunData, RunMode, evaluate, flown_without
 from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.recording.file_names import (
     AGENT_FILE,
@@ -293,9 +293,12 @@ def report_run(directory: Path, rules: Rules) -> Path:
 
 
 def _cut_off(run: RunData, outcome: Outcome) -> Iterator[str]:
-    """Yield whose ticks end in flight although the run was completed: the disk was full from then on."""
+    """Yield whose ticks end in flight, or before it, although the run was completed: the disk was full from then on."""
+    without = flown_without(run.events)
     for agent, rows in run.ticks.items() if outcome.outcome == "completed" else ():
-        if len(rows) and len(flight_rows(rows[-1:])):
+        if not len(rows) or agent in without:
+            continue
+        if len(flight_rows(rows[-1:])) or rows["phase"][-1] < Phase.ARM:
             phase = Phase(int(rows["phase"][-1])).name
             yield f"the recording of agent {agent} ends in {phase}: the rest of its flight can't be judged"
 

@@ -74,6 +74,15 @@ def test_a_file_dated_before_1980_is_bundled(folder: Path, tmp_path: Path) -> No
     assert f"{folder.name}/events.jsonl" in zipfile.ZipFile(written).namelist()
 
 
+def test_what_can_not_be_bundled_is_refused_in_words(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="its folder does not exist"):
+        bundle(BundleOptions(folder=folder, output=tmp_path / "none" / "run.zip"))
+    odd = Path(os.fsdecode(os.fsencode(shutil.copytree(folder, tmp_path / "odd")) + b"/\xff.txt"))
+    odd.write_text("")
+    with pytest.raises(StartError, match="is not UTF-8, and can't be in an archive"):
+        bundle(BundleOptions(folder=tmp_path / "odd", output=tmp_path / "run.zip"))
+
+
 def test_a_file_that_vanishes_while_it_is_bundled_is_named(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

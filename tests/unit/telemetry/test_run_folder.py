@@ -394,6 +394,19 @@ def test_a_run_whose_summary_is_removed_is_judged_as_it_was(tmp_path: Path, outc
         assert again == judged
 
 
+def test_a_completed_run_of_whose_flight_nothing_was_recorded_is_not_judged_as_flown(tmp_path: Path) -> None:
+    """The disk was full from before its start on; with one agent no distance was missed either."""
+    write_config(tmp_path, "")
+    write_run(tmp_path, 3, 20.0)
+    rows = np.fromfile(tmp_path / "agent-0.ticks", TICK_DTYPE)
+    rows["phase"] = Phase.STANDBY
+    (tmp_path / "agent-0.ticks").write_bytes(rows.tobytes())
+    (tmp_path / OUTCOME).write_text('{"outcome": "completed", "problems": []}')
+    report_run(tmp_path, RULES)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert "the recording of agent 0 ends in STANDBY: the rest of its flight can't be judged" in summary["violations"]
+
+
 def test_a_completed_run_whose_recording_ends_in_flight_is_not_judged_to_its_end(tmp_path: Path) -> None:
     write_config(tmp_path, "")
     write_run(tmp_path, 3, 20.0)
