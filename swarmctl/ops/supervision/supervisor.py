@@ -334,8 +334,7 @@ class FlightSupervisor:
         if any(_end_of(child) not in self._reported for child in self._agents() if child.poll() is not None):
             return False  # it has ended since the agents were watched, and may say how the flight went
         if self._land_ordered_s is not None and now_s > self._land_until_s:
-            recovered = () if self._vehicles_lost else [v for v in running if self._recovery.is_on(v.agent)]
-            self._end_late([view for view in running if view not in recovered])  # those have times of their own
+            self._end_late([view for view in running if not self._is_recovered(view)])
             return not running
         if not running:
             deaths_s = [
@@ -348,6 +347,11 @@ class FlightSupervisor:
             bus_is_suspect = len(running) == len(self._views) and len(running) > 1
             self._land(_LAND_S if bus_is_suspect else _AFTER_DEATH_S)
         return False
+
+    def _is_recovered(self, view: AgentView) -> bool:
+        """Return whether its vehicle is being landed, which has a time of its own."""
+        agent = view.agent
+        return self._recovery.is_on(agent) and not (self._vehicles_lost or self._recovery.is_overdue(agent))
 
     def _end_late(self, running: list[AgentView]) -> None:
         """Kill who has not landed in time, and who is done and only waits for those."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import socket
+import termios
 import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import serial
 
 from swarmctl.errors import StartError
 from swarmctl.mavlink import serial_devices
@@ -308,6 +311,30 @@ def drained(fd: int) -> bytes:
 def test_a_missing_serial_device_is_a_start_error_with_its_name() -> None:
     with pytest.raises(StartError, match="/dev/no-such-port at 57600"):
         open_transport("serial:///dev/no-such-port:57600")
+
+
+def test_a_serial_device_that_vanishes_while_it_is_opened_again_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A loose plug; pyserial lets an error of the set-up pass that is no OSError."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    link = SerialTransport(os.ttyname(slave), 57600)
+    monkeypatch.setattr(link._port, "read", lambda size: os.read(-1, size))
+    assert link.receive(0) == []
+
+    def vanished(*_: object, **__: object) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as change:
+        change.setattr(serial, "Serial", vanished)
+        for second in range(1, 4):
+            assert link.receive(second * SECOND) == []
+    link.receive(9 * SECOND)
+    os.write(master, frame(b"back"))
+    time.sleep(0.02)
+    assert [d.data for d in link.receive(10 * SECOND)] == [frame(b"back")]
+    link.close()
+    os.close(master)
+    os.close(slave)
 
 
 def test_a_serial_port_that_is_unplugged_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
