@@ -110,6 +110,7 @@ class Coordination:
         self._ended: frozenset[int] = frozenset()  # peers that take no part any more, by evidence
         self._membership_said: tuple[frozenset[int], ...] = (frozenset(),) * 3
         self._begun_us: int | None = None
+        self._begun_without: frozenset[int] = frozenset()  # peers that had been excused when this agent began
         self._stepped_us = 0  # time of the newest tick in which the agent flew
         self._conflicting: set[int] = set()
         self.committed_peers: Mapping[int, Sequence[Trajectory]] = {}
@@ -150,7 +151,8 @@ class Coordination:
         self._ended = self._world_model.statuses.ended
         suspected = self._suspected(utc_us)
         # Before the flight; who is started again knows of nobody so.
-        came = self._peers - self._world_model.statuses.excused
+        excused = self._world_model.statuses.excused if self._begun_us is None else self._begun_without
+        came = self._peers - excused
         membership.update(suspected, peers.exclusions, self._ended, votes=peers.heard_before_flight >= came)
         said = (membership.exclusions.suspected, membership.exclusions.promised, membership.excluded)
         if said != self._membership_said:
@@ -178,7 +180,10 @@ class Coordination:
         """
         commitments = self._commitments
         if not self._is_committed:
-            self._is_committed, self._begun_us, self._others_m_s = True, utc_us, 0.0
+            self._is_committed, self._others_m_s = True, 0.0
+            if self._begun_us is None:
+                self._begun_without = self._world_model.statuses.excused
+            self._begun_us = utc_us
             commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
         since_us, self._stepped_us = utc_us - self._stepped_us, utc_us
         self._watch(utc_us, since_us, state)
@@ -352,10 +357,13 @@ class Coordination:
     def _required_peers(self) -> frozenset[int]:
         """Return peers that fly by commitments and have to acknowledge what they are not spared.
 
-        One that was excluded while this agent was far from it may have committed to something unseen.
+        One that was excluded while this agent was far from it may have committed to something unseen. One without which
+        the swarm began, and which has come since, may have no vehicle: until it says what it is committed to it can
+        acknowledge nothing, nor commit to anything, for which it needs the acknowledgement of this agent.
         """
         excluded = self._membership.excluded - self._peer_trajectories.far_from
-        return self._peers - excluded - self._ended - self._world_model.statuses.uncommitted
+        absent = self._begun_without - self._peer_trajectories.newest.keys()
+        return self._peers - excluded - absent - self._ended - self._world_model.statuses.uncommitted
 
     def _absent(self) -> set[int]:
         """Return peers whose liveliness token is not on the bus."""
