@@ -20,8 +20,10 @@ _STUCK_S = 5.0  # without anything printed, after which the end does not wait fo
 class BackgroundDisplay:
     """Has another display print what it is given, in the same order; of states only the newest.
 
+    What is printed after the end, the verdict, is waited for: there is nothing left to supervise.
+
     Args:
-        display: used in the thread alone.
+        display: used in the thread alone, until it has ended.
     """
 
     def __init__(self, display: Display) -> None:
@@ -59,6 +61,9 @@ class BackgroundDisplay:
             self._thread.join(_STUCK_S)
 
     def _put(self, prints: Callable[[], None]) -> None:
+        if self._is_closed and not self._thread.is_alive():
+            prints()
+            return
         with self._changed:
             self._waiting.append(prints)
             self._changed.notify()

@@ -53,7 +53,8 @@ def test_lines_keep_their_order_and_of_states_the_newest_is_shown() -> None:
     view.note = "later"
     shown.goes_on.set()
     display.close()
-    assert shown.said == ["first", "c", "second", "d", "closed"]
+    display.print_line("verdict")
+    assert shown.said == ["first", "c", "second", "d", "closed", "verdict"]
 
 
 def test_the_end_waits_for_a_slow_terminal_and_not_for_one_that_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
