@@ -10,6 +10,7 @@ import numpy as np
 
 from swarmctl.agent.planning.commitment_publisher import CommitmentPublisher
 from swarmctl.agent.planning.non_participants import NonParticipants, most_are_heard
+from swarmctl.agent.planning.unanswered_proposals import UnansweredProposals
 from swarmctl.agent.sensing.deviations import Deviations
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.bus import topics
@@ -107,6 +108,7 @@ class Coordination:
         self._far_silent_us = round(_FAR_PERIODS * 1e6 / far_hz) if far_hz else _SILENT_US
         self._clock_error_max_us = 1e6 * params.clock_error_max_s
         self._membership, self._deviations = Membership(agent, peers), Deviations()
+        self._unanswered = UnansweredProposals(agent)
         self._ended: frozenset[int] = frozenset()  # peers that take no part any more, by evidence
         self._membership_said: tuple[frozenset[int], ...] = (frozenset(),) * 3
         self._begun_us: int | None = None
@@ -191,6 +193,7 @@ class Coordination:
         known = self._near_messages()
         asked, near = required - self._still_spared(utc_us), self._far_peers.near
         self.cut_off = self._why_cut_off(utc_us, asked & near if commitments.proposal is None else asked)
+        self._unanswered.update(commitments.proposal, asked, newest)
         if commitments.proposal is not None:
             commitments.update(utc_us, {a: i for a, i in newest.items() if a not in self._spared}, asked)
         relied_on = self._relied_on(utc_us, known, required)
@@ -206,7 +209,7 @@ class Coordination:
         commitments.evade(now)
         self._evade_silent(replace(now, peers=known), relied_on)
         unsure = {a for a in required & near if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
-        self.alert = self._why_slow(unsure)
+        self.alert = self._why_slow(unsure, utc_us)
         if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
             heard = (relied_on & required) - self._absent()
             others = self._others(begin_us, state, phase, heard, self._entered_ahead)
@@ -370,10 +373,13 @@ class Coordination:
         alive = self._bus.alive()
         return {agent for agent in self._peers if agent_name(agent) not in alive}
 
-    def _why_slow(self, unsure: Set[int]) -> str:
+    def _why_slow(self, unsure: Set[int], utc_us: int) -> str:
         if self._grip > Grip.OUTSIDE:
             return f"blown off what it had committed to: {self._grip.name.lower()}"
-        return f"the clock of {_names(unsure)} is not known well enough" if unsure else ""
+        if unsure:
+            return f"the clock of {_names(unsure)} is not known well enough"
+        deaf = self._unanswered.by(utc_us) - self._peer_trajectories.silent(self._peers, utc_us, _SUSPECT_US)
+        return f"{_names(deaf)} answers no proposal, and may take it for ended" if deaf else ""
 
     def _why_cut_off(self, utc_us: int, required: Set[int]) -> str:
         if self._grip is Grip.LOST:

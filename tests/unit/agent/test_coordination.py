@@ -337,3 +337,16 @@ def test_a_far_peer_that_has_ended_makes_no_proposal_ask_all(far_bench: Bench, h
     said = [decode_trajectory_message(payload) for _, payload in far_bench.peer.receive(topics.FAR_TRAJECTORY)]
     asked = {message.proposal.asks_far for message in said if message is not None and message.proposal is not None}
     assert (True in asked) is not has_ended
+
+
+def test_a_peer_that_is_heard_and_answers_no_proposal_is_named() -> None:
+    """It may have been told that this agent has ended, which others know better."""
+    bench = Bench()
+    bench.fly(1.0, each=bench.send)
+    assert bench.coordination.alert == ""
+    bench.answers = False
+    bench.fly(12.0, each=bench.send)
+    assert bench.coordination.alert == "agent-1 answers no proposal, and may take it for ended"
+    bench.answers = True
+    bench.fly(3.0, each=bench.send)
+    assert bench.coordination.alert == ""
