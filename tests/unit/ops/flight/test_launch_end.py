@@ -253,6 +253,7 @@ def test_who_lands_the_vehicle_of_another_agent_is_told_what_its_parameters_were
     services.children[ROUTER] = cast(Any, SimpleNamespace(poll=lambda: None))
     command = cast(Any, services.recover(0))
     assert command.argv[command.argv.index("--only-land") + 1 :] == arguments
+    services.display.close()
     assert capsys.readouterr().out.startswith(said)
     services.children.clear()
     services.stop(0.0)
