@@ -68,6 +68,15 @@ def test_the_same_agent_decides_the_same_in_every_phase(folder: Path) -> None:
         assert lines_of(agent)[0].startswith(f"agent-{agent.agent}: {agent.compared} ticks")
 
 
+def test_the_keys_of_its_vehicles_are_needed_by_nobody_who_decides_a_run_again(folder: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(folder, tmp_path / "elsewhere")
+    config = copy / "config.toml"
+    keys = 'signing_keys = ["/none/0.key", "/none/1.key"]'
+    config.write_text(re.sub(r"signing_keys = \[\]", keys, config.read_text()))
+    assert keys in config.read_text()
+    assert [agent.plans_differ for agent in decisions_of_run(copy, ())] == [0, 0]
+
+
 def test_messages_that_come_late_are_known_in_the_tick_that_took_them(tmp_path: Path) -> None:
     """As in a launch, where they come whenever they come: they were given to the ticks that follow their stamps.
 

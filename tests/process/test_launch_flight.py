@@ -272,6 +272,14 @@ def test_an_agent_that_can_not_start_lands_the_others(tmp_path: Path) -> None:
     assert scene.children["agent-0"].poll() == 130
 
 
+@pytest.mark.parametrize(("armed", "code"), [(False, EXIT_START), (True, EXIT_MISSION)])
+def test_a_stop_on_the_ground_is_told_from_a_flight_that_was_stopped(tmp_path: Path, armed: bool, code: int) -> None:
+    """Both pass LAND, and a status of it may come, or not."""
+    scene = ScriptedServices(tmp_path, [ends(130, 2.0), ends(EXIT_START, 0.5)])
+    scene.phase, scene.vehicle = Phase.LAND, {"armed": armed}
+    assert scene.fly().exit_code(violated=False) == code
+
+
 def test_an_agent_that_crashes_before_its_first_status_did_not_start(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [ends(1)])
     scene.silent.add(0)
