@@ -20,7 +20,8 @@ _STUCK_S = 5.0  # without anything printed, after which the end does not wait fo
 class BackgroundDisplay:
     """Has another display print what it is given, in the same order; of states only the newest.
 
-    What is printed after the end, the verdict, is waited for: there is nothing left to supervise.
+    What is printed after the end, the verdict, is waited for: there is nothing left to supervise. It is lost where the
+    terminal still takes nothing; the run folder holds it.
 
     Args:
         display: used in the thread alone, until it has ended.
