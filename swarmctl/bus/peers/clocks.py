@@ -3,8 +3,9 @@
 A message that a peer stamped s, and that arrived at r by the own clock, was under way for a while: the peer is ahead by
 at least s - r. The peer also says when, by its clock, the newest own message arrived: it is ahead by at most that time
 less the own stamp. Both bounds hold whatever the delays are (the four timestamps of RFC 5905, as an interval instead of
-its midpoint); short delays make them tight. Bounds of the last seconds are kept, because clocks drift. Agents that
-commit say so in every trajectory message, others in their statuses.
+its midpoint); short delays make them tight. A bound is kept until a newer one is tighter, and becomes wider with time:
+the clocks of agents go apart by up to 2 %, for each follows a step of its computer's UTC by 1 % of the time that passes
+(`swarmctl.wall_clock`). Agents that commit say so in every trajectory message, others in their statuses.
 
 What is applied is 0 as long as 0 is possible, and the middle of the interval when what was applied is not: equal clocks
 are never corrected. Its error is at most the width of the interval, which is a round trip.
@@ -13,12 +14,10 @@ are never corrected. Its error is at most the width of the interval, which is a 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 from swarmctl.bus.bus import agent_name
 
-_WINDOW_US = 5_000_000  # bounds of this window and of the one before are kept
-_DRIFT_US = 2_000  # two clocks drift apart by less in two windows: 200 ppm
+_DRIFT_PART = 50  # two clocks go apart by less than this part of the time that passes: 2 %
 _UNKNOWN_US = 1 << 62
 _UNMEASURED_US = 1 << 61  # bounds beyond are none
 MOST_APART_US = 10_000_000  # that is allowed for; seals are held to it, too
@@ -27,50 +26,33 @@ _ADVICE = "Set the clocks of the hosts (chrony, PTP)"
 _REPORTED_US = 50_000  # corrections that differ by more from the last one reported are
 
 
-@dataclass(slots=True)
-class _Bounds:
-    """Lower and upper bound of how far a clock is ahead [us]."""
-
-    low_us: int = -_UNKNOWN_US
-    high_us: int = _UNKNOWN_US
-
-
 class _PeerClock:
     """The clock of one peer.
 
     Attributes:
         ahead_us: how far it is taken to be ahead.
         reported_us: what was reported of that.
-        interval_us: least and most that it can be ahead.
+        low_us, high_us: least and most that it can be ahead.
         error_us: largest error that `ahead_us` may have.
     """
 
+    __slots__ = ("_narrowed_us", "ahead_us", "error_us", "high_us", "low_us", "reported_us")
+
     def __init__(self) -> None:
-        self._now, self._before = _Bounds(), _Bounds()
-        self._since_us = 0
+        self._narrowed_us = 0
         self.ahead_us = self.reported_us = 0
-        self.interval_us, self.error_us = (-_UNKNOWN_US, _UNKNOWN_US), _UNKNOWN_US
+        self.low_us, self.high_us, self.error_us = -_UNKNOWN_US, _UNKNOWN_US, _UNKNOWN_US
 
     def narrow(self, low_us: int, high_us: int, utc_us: int) -> None:
         """Take in new bounds, and correct what is applied if it is impossible now."""
-        if utc_us - self._since_us >= _WINDOW_US:
-            self._now, self._before, self._since_us = _Bounds(), self._now, utc_us
-        elif low_us <= self._now.low_us and high_us >= self._now.high_us:
-            return  # as known, like most
-        self._now.low_us = max(self._now.low_us, low_us)
-        self._now.high_us = min(self._now.high_us, high_us)
-        low, high = self._interval_us()
+        drift_us = max(0, -((self._narrowed_us - utc_us) // _DRIFT_PART))
+        self._narrowed_us = utc_us
+        low, high = max(low_us, self.low_us - drift_us), min(high_us, self.high_us + drift_us)
         if low > high:  # a clock was set
-            self._now, self._before = _Bounds(low_us, high_us), _Bounds()
             low, high = low_us, high_us
-        if not low <= self.ahead_us <= high and low > -_UNKNOWN_US and high < _UNKNOWN_US:
+        if not low <= self.ahead_us <= high and low > -_UNMEASURED_US and high < _UNMEASURED_US:
             self.ahead_us = (low + high) // 2
-        self.interval_us, self.error_us = (low, high), max(high - self.ahead_us, self.ahead_us - low)
-
-    def _interval_us(self) -> tuple[int, int]:
-        """Return the bounds by all that is kept."""
-        low = max(self._now.low_us, self._before.low_us - _DRIFT_US)
-        return low, min(self._now.high_us, self._before.high_us + _DRIFT_US)
+        self.low_us, self.high_us, self.error_us = low, high, max(high - self.ahead_us, self.ahead_us - low)
 
 
 class PeerClocks:
@@ -155,7 +137,7 @@ class PeerClocks:
         clock = self._clocks.get(agent)
         if clock is None or (self._trusts_equal and not clock.ahead_us):
             return 0
-        if clock.interval_us[0] <= -_UNMEASURED_US or clock.interval_us[1] >= _UNMEASURED_US:
+        if clock.low_us <= -_UNMEASURED_US or clock.high_us >= _UNMEASURED_US:
             return 0
         return clock.error_us
 

@@ -18,7 +18,7 @@ from swarmctl.core.trajectory_message import Exclusions, TrajectoryMessage
 MAX_BEGIN_US = 10_000_000  # from now; a trajectory that begins later comes from another clock
 MAX_CLOCK_ERROR_US = 10_000_000  # a clock known less well is known as badly; nothing is committed then
 _STAMPS = 64  # of messages of each peer that are kept; more than relays wait
-_BETTER_01 = 0.5  # share of the error of a clock at which trajectories are decoded anew
+_BETTER_01, _WORSE_01 = 0.5, 1.5  # shares of the error of a clock at which trajectories are decoded anew
 
 
 class PeerTrajectories:
@@ -60,7 +60,7 @@ class PeerTrajectories:
         """Check one message and keep it if it is accepted; the bus guarantees the name `sender`, `utc_us` is now."""
         number = self._numbers.get(sender, -1)
         memory, ahead_us = dict(self._memory.get(sender, {})), self._clocks.ahead_us(number)
-        error_us = min(self._clocks.error_us(number), MAX_CLOCK_ERROR_US) if number in self._verifiers else 0
+        error_us = self._clock_error_us(number) if number in self._verifiers else 0
         message = decode_trajectory_message(payload, memory, ahead_us, error_us)
         if message is None or (reason := self._refusal(sender, message, utc_us)):
             self._refusals.add(sender, TRAJECTORY.name, MALFORMED if message is None else reason, utc_us)
@@ -80,8 +80,8 @@ class PeerTrajectories:
             self.received_utc_us[message.agent] = utc_us
             self._stamps_us.setdefault(message.agent, deque(maxlen=_STAMPS)).append(message.sent_utc_us)
             self._measure(message, utc_us)
-            is_better = self._clocks.error_us(message.agent) < _BETTER_01 * self._used_error_us.get(sender, error_us)
-            if self._clocks.ahead_us(message.agent) != ahead_us or is_better:
+            share_01 = self._clock_error_us(message.agent) / max(1, self._used_error_us.get(sender, error_us))
+            if self._clocks.ahead_us(message.agent) != ahead_us or not _BETTER_01 <= share_01 <= _WORSE_01:
                 self._memory[sender] = {}
                 self._used_error_us.pop(sender, None)
             else:
@@ -124,6 +124,9 @@ class PeerTrajectories:
             stamp_us, arrival_us = times
             self._clocks.answered(message.agent, stamp_us, arrival_us, utc_us)
             self.confirmed_us[message.agent] = max(stamp_us, self.confirmed_us.get(message.agent, 0))
+
+    def _clock_error_us(self, agent: int) -> int:
+        return min(self._clocks.error_us(agent), MAX_CLOCK_ERROR_US)
 
     def _refusal(self, sender: str, message: TrajectoryMessage, utc_us: int) -> str:
         if sender != agent_name(message.agent):

@@ -342,6 +342,18 @@ def test_trajectories_say_how_well_the_clock_of_their_sender_is_known() -> None:
         assert received.clock_error_us == store.clocks.error_us(2) <= 20_000
 
 
+def test_trajectories_say_so_when_the_clock_of_their_sender_is_known_less_well() -> None:
+    """Its messages take longer and longer, as on a link that fills up."""
+    store = Store()
+    for seq in range(1, 40):
+        stamp_us = store.utc_us + 20_000 - 2_000 * seq  # sent so long before it is received
+        answered = {1: (stamp_us, stamp_us)}
+        store.offer(replace(message(seq=seq, propose=False), sent_utc_us=stamp_us, heard=answered))
+    told_us = store.peers.newest[2].committed.clock_error_us
+    assert told_us > 5_000
+    assert told_us * 1.6 > store.clocks.error_us(2)
+
+
 @pytest.mark.parametrize(("after_s", "spread_m"), [(0.0, 0.075), (1.0, 0.075), (3.1, 0.0)])
 def test_an_error_of_the_clock_is_worth_as_much_as_the_vehicle_moves_in_it(after_s: float, spread_m: float) -> None:
     moving = np.tile([0.0, 1.5, 0.0], (21, 1))

@@ -68,7 +68,7 @@ def test_a_path_gets_room_for_the_error_of_its_clock() -> None:
     store.offer(encode_path(path))
     assert store.paths.latest()[0].margin_m == path.margin_m, "not measured"
     clocks.received(1, NOW_US, NOW_US + 30_000)
-    clocks.answered(1, NOW_US, NOW_US + 30_000, NOW_US + 40_000)
+    clocks.answered(1, NOW_US, NOW_US + 30_000, NOW_US + 30_000)
     asked = np.array([1.0, 0.0, 0.5])
     store.offer(encode_path(replace(path, seq=2, setpoint_accel_ned_m_s2=asked)))
     (found,) = store.paths.latest()
@@ -80,7 +80,7 @@ def test_that_room_is_for_where_the_peer_is_fastest() -> None:
     store, clocks = Store(), PeerClocks([1, 2], lambda *_, **__: None)
     store.paths = PeerPaths([1, 2], 50.0, store.refusals, store.presence, clocks=clocks)
     clocks.received(1, NOW_US, NOW_US + 30_000)
-    clocks.answered(1, NOW_US, NOW_US + 30_000, NOW_US + 40_000)
+    clocks.answered(1, NOW_US, NOW_US + 30_000, NOW_US + 30_000)
     braking = np.array([[x_m, 0.0, 0.0] for x_m in (0.0, 0.06, 0.10, 0.12, 0.12)])  # from 3 m/s
     path = builders.predicted_path(agent=1, seq=1, t0_utc_us=NOW_US, dt_us=20_000, pos_ned_m=braking)
     store.offer(encode_path(path))
