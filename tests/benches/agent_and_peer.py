@@ -108,7 +108,12 @@ class Bench:
             self.world_model.receive(utc_us)
             self.coordination.receive(utc_us)
             self.coordination.step(
-                utc_us, self.state, Phase.TRACK, DesiredReference(self.wanted), disturbance_ned_m_s2=np.zeros(3)
+                utc_us,
+                self.state,
+                Phase.TRACK,
+                DesiredReference(self.wanted),
+                state_utc_us=utc_us,
+                disturbance_ned_m_s2=np.zeros(3),
             )
             self.coordination.publish(utc_us, unsure_m=0.0, relays=True)
 

@@ -170,7 +170,14 @@ class Coordination:
         return self._peer_trajectories.silent(self._peers - self._ended, utc_us, _SUSPECT_US)
 
     def step(
-        self, utc_us: int, state: VehicleState, phase: Phase, desired: DesiredReference, *, disturbance_ned_m_s2: Array
+        self,
+        utc_us: int,
+        state: VehicleState,
+        phase: Phase,
+        desired: DesiredReference,
+        *,
+        state_utc_us: int,
+        disturbance_ned_m_s2: Array,
     ) -> None:
         """Apply rules 2 to 4 while this agent flies.
 
@@ -178,6 +185,7 @@ class Coordination:
             utc_us: now.
             state, phase: own vehicle and mission.
             desired: motion that the agent would follow if it were alone.
+            state_utc_us: when the vehicle was in that state, by which it is compared with what it flies.
             disturbance_ned_m_s2: (3,) estimated acceleration by wind.
         """
         commitments = self._commitments
@@ -186,9 +194,9 @@ class Coordination:
             if self._begun_us is None:
                 self._begun_without = self._world_model.statuses.excused
             self._begun_us = utc_us
-            commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
+            commitments.begin(state.pos_ned_m, state.vel_ned_m_s, state_utc_us)
         since_us, self._stepped_us = utc_us - self._stepped_us, utc_us
-        self._watch(utc_us, since_us, state)
+        self._watch(utc_us, since_us, state, state_utc_us)
         required, newest = self._required_peers(), self._peer_trajectories.newest
         known = self._near_messages()
         asked, near = required - self._still_spared(utc_us), self._far_peers.near
@@ -341,17 +349,18 @@ class Coordination:
         assert self._commitments.flown is not None
         return slowed(desired, np.array(self._commitments.flown.at(begin_us)[0]), self._tube.pace_01)
 
-    def _watch(self, utc_us: int, since_us: int, state: VehicleState) -> None:
+    def _watch(self, utc_us: int, since_us: int, state: VehicleState, state_utc_us: int) -> None:
         """Commit anew, from the measured state, when the commitment is lost; report how well it is held."""
         commitments = self._commitments
-        commitments.wait_for(state.pos_ned_m, utc_us, since_us, self._tube_m)
+        commitments.wait_for(state.pos_ned_m, state_utc_us, since_us, self._tube_m)
         assert commitments.committed is not None and commitments.flown is not None
-        pos, vel = map(np.array, commitments.committed.at(utc_us))
+        state_utc_us = max(state_utc_us, commitments.committed.t0_utc_us)  # before it begins it is as if at rest
+        pos, vel = map(np.array, commitments.committed.at(state_utc_us))
         self._error_m = error_m = float(np.linalg.norm(state.pos_ned_m - pos))
         error_m_s = float(np.linalg.norm(state.vel_ned_m_s - vel))
-        late_m = math.dist(pos, commitments.flown.at(utc_us)[0])
+        late_m = math.dist(pos, commitments.flown.at(state_utc_us)[0])
         if self._tube.update(utc_us, error_m, error_m_s, late_m):
-            commitments.restart(state.pos_ned_m, state.vel_ned_m_s, utc_us)
+            commitments.restart(state.pos_ned_m, state.vel_ned_m_s, state_utc_us)
         before, self._grip = self._grip, self._tube.grip(utc_us)
         if self._grip is not before:
             is_off, grip = self._grip is not Grip.HELD, self._grip.name

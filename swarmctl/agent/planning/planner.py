@@ -135,6 +135,7 @@ class Planner:
             SeparationInputs(
                 utc_us=utc_us,
                 state=state,
+                state_utc_us=self._utc_of_us(state.t_us),
                 phase=self._mission.phase,
                 desired=self._references.desired(now_us, utc_us),
                 horizon_utc_us=utc_us + self._horizon_us,

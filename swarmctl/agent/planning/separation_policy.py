@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from swarmctl.agent.planning.coordination import Coordination
+from swarmctl.agent.planning.state_age import StateAge
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOut, KeepOuts
 from swarmctl.control.commit.situation import DesiredReference
@@ -24,6 +25,7 @@ class SeparationInputs:
 
     utc_us: int
     state: VehicleState
+    state_utc_us: int  # of its stamp
     phase: Phase
     desired: DesiredReference  # motion the agent would follow if it were alone
     horizon_utc_us: Times  # (longest+1,) times of the controller's reference
@@ -129,6 +131,7 @@ class Guaranteed:
 
     def __init__(self, coordination: Coordination, yaw_rad: float, stopwatch_ns: Callable[[], int]) -> None:
         self._coordination, self._yaw_rad, self._stopwatch_ns = coordination, yaw_rad, stopwatch_ns
+        self._state_age = StateAge()
 
     @property
     def coordination(self) -> Coordination:
@@ -152,6 +155,7 @@ class Guaranteed:
             inputs.state,
             inputs.phase,
             inputs.desired,
+            state_utc_us=self._state_age.seen_us(inputs.state_utc_us, inputs.utc_us),
             disturbance_ned_m_s2=inputs.disturbance_ned_m_s2,
         )
         duration_ns = self._stopwatch_ns() - began_ns

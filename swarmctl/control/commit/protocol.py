@@ -182,7 +182,7 @@ class Commitments:
         """Hold back what is flown while it is more than `allowed_m` ahead of the vehicle at (3,), at most to a stand.
 
         Args:
-            pos_ned_m, utc_us: where the vehicle is now.
+            pos_ned_m, utc_us: where the vehicle was, and when.
             since_us: time since the last call, of which some may be lost.
             allowed_m: how far behind it may be.
         """

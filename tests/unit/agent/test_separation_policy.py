@@ -29,6 +29,7 @@ def inputs(bench: Bench) -> SeparationInputs:
     return SeparationInputs(
         utc_us=utc_us,
         state=bench.state,
+        state_utc_us=utc_us,
         phase=Phase.TRACK,
         desired=DesiredReference(bench.wanted),
         horizon_utc_us=utc_us + np.arange(6) * 100_000,
