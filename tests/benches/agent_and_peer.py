@@ -38,7 +38,8 @@ PLACE = np.array([3.0, 0.0, -2.0])  # of the peer
 class Bench:
     """One agent, and a peer that is only its messages; others of which nothing is heard may belong to the swarm."""
 
-    def __init__(self, far_hz: float = 0.0, peers: Sequence[int] = (1,)) -> None:
+    def __init__(self, far_hz: float = 0.0, peers: Sequence[int] = (1,), rate_hz: float = RATE_HZ) -> None:
+        self.tick_us = round(1e6 / rate_hz)
         self.clock, self.told = SimClock(), list[tuple[str, dict[str, Any]]]()
         self.hub = LocalHub(self.clock.now_us, 1)
         self.bus = self.hub.connect(agent_name(0))
@@ -53,7 +54,7 @@ class Bench:
             separation,
             self.bus,
             utc_us=self.clock.utc_us,
-            rate_hz=RATE_HZ,
+            rate_hz=rate_hz,
             note=lambda *_, **__: None,
             vouchers={},
             quorum=1,
@@ -72,7 +73,7 @@ class Bench:
             bus=self.bus,
             utc_us=self.clock.utc_us,
             note=lambda name, **fields: self.told.append((name, fields)),
-            rate_hz=RATE_HZ,
+            rate_hz=rate_hz,
             far_peers=FarPeers(
                 peers,
                 speed_m_s=SPEED_M_S if far_hz else 0.0,
@@ -101,8 +102,8 @@ class Bench:
         )
 
     def fly(self, seconds: float, each: Callable[[], None] = lambda: None) -> None:
-        for _ in range(round(seconds / 0.02)):
-            self.clock.advance(20_000)
+        for _ in range(round(seconds * 1e6 / self.tick_us)):
+            self.clock.advance(self.tick_us)
             each()
             utc_us = self.clock.utc_us()
             self.world_model.receive(utc_us)

@@ -30,7 +30,7 @@ from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import MAX_MARGIN_M, Array, Phase, VehicleState
 
 _SUSPECT_US = 5_000_000  # without a message, after which a peer is suspected: bursts of loss end sooner
-_SILENT_US = 160_000  # four messages have not come, at the least
+_SILENT_PERIODS, _SILENT_US = 4, 160_000  # so many messages have not come, at the least
 _FAR_PERIODS = 2.5  # likewise of a peer of which this agent hears only what it tells those that are far
 _GAP_US = 1_000_000  # without a fresh state, after which nothing is committed any more
 _FASTER_01 = 1.1  # of the speed at which somebody else flies the vehicle, which may grow until the next message
@@ -105,7 +105,8 @@ class Coordination:
         self._tube = Tube(self._tube_m)
         self._grip, self._error_m = Grip.HELD, 0.0
         self._entered_now, self._entered_ahead = Encounters(), Encounters()  # where a plan begins now, or ahead
-        self._far_silent_us = round(_FAR_PERIODS * 1e6 / far_hz) if far_hz else _SILENT_US
+        self._silent_us = max(_SILENT_US, round(_SILENT_PERIODS * 1e6 / rate_hz))
+        self._far_silent_us = round(_FAR_PERIODS * 1e6 / far_hz) if far_hz else self._silent_us
         self._clock_error_max_us = 1e6 * params.clock_error_max_s
         self._membership, self._deviations = Membership(agent, peers), Deviations()
         self._unanswered = UnansweredProposals(agent)
@@ -419,7 +420,7 @@ class Coordination:
         """
         everybody = self._peers - self._ended
         near = self._far_peers.near & everybody
-        silent = self._peer_trajectories.silent(near, now.utc_us, _SILENT_US)
+        silent = self._peer_trajectories.silent(near, now.utc_us, self._silent_us)
         doubted = self._non_participants.without_setpoints(silent & relied_on, now.utc_us)
         if not doubted:
             return

@@ -32,7 +32,7 @@ from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Array, Phase, PredictedPath
 
-_EXPECTED_US = 160_000  # `heartbeat_s` and three ticks; whose path is older may fly another one
+_EXPECTED_TICKS = 3  # after which a path is late that has not come; its peer may fly another one
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 
 
@@ -45,7 +45,7 @@ class WorldModel:
         params: distances and ages.
         bus: source of messages, drained by `receive`.
         utc_us: the own clock, by which messages arrive.
-        rate_hz: tick rate of every agent.
+        rate_hz, heartbeat_s: tick rate of every agent, and how long its paths are apart at most.
         vouchers: agents of which each sender may say that they have ended.
         quorum: see `AgentSetup`.
         model: of the own vehicle; those of peers are taken for such ones.
@@ -68,6 +68,7 @@ class WorldModel:
         *,
         utc_us: Callable[[], int],
         rate_hz: float,
+        heartbeat_s: float = 0.1,
         note: Callable[..., None],
         vouchers: Mapping[str, Set[int]],
         quorum: int,
@@ -78,6 +79,7 @@ class WorldModel:
         self._peers, self._quorum, self._utc_us = peers, quorum, utc_us
         self._model, self._loss_s = model, loss_s
         self._budget = params.budget
+        self._expected_us = round(1e6 * (heartbeat_s + _EXPECTED_TICKS / rate_hz))
         self.refusals, self.presence = Refusals(note), Presence(bus)
         self.clocks = PeerClocks(peers, note, trusts_equal=params.mode == "best_effort")
         self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence, clocks=self.clocks)
@@ -277,7 +279,7 @@ class WorldModel:
             return (path,)  # as its autopilot or a pilot flies it
         if self.statuses.process_has_ended(agent, path.boot_id):  # whatever a process says that was started after it
             return (self._without_setpoints(path),)
-        oldest_us = utc_us - _EXPECTED_US
+        oldest_us = utc_us - self._expected_us
         if path.t0_utc_us >= oldest_us or all(late.agent != agent for late in self.paths.late(oldest_us)):
             return (path,)
         return path, self._without_setpoints(replace(path, setpoint_accel_ned_m_s2=None))

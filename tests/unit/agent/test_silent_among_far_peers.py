@@ -16,7 +16,7 @@ from swarmctl.control.collision.separation import KeepOuts, SeparationParams, ke
 from swarmctl.core.trajectory import Trajectory, resting
 from swarmctl.core.trajectory_message import ANYWHERE, Proposal, Reach
 from tests import builders
-from tests.benches.agent_and_peer import HERE, SPEED_M_S, STRETCH_M, Bench
+from tests.benches.agent_and_peer import HERE, RATE_HZ, SPEED_M_S, STRETCH_M, Bench
 
 FROM, TO = HERE + np.array([0.0, 2.6, -1.2]), HERE + np.array([0.0, 0.0, -1.2])  # of a proposal of peer 2: above
 
@@ -27,10 +27,14 @@ class Amid(Bench):
     Args:
         far_hz: rate at which those that are far are told.
         places: (3,) of peers 2 and 3, from the agent.
+        far: whether these two are.
+        rate_hz: of the ticks of all.
     """
 
-    def __init__(self, far_hz: float, places: dict[int, np.ndarray], *, far: bool = False) -> None:
-        super().__init__(far_hz=far_hz, peers=(1, 2, 3))
+    def __init__(
+        self, far_hz: float, places: dict[int, np.ndarray], *, far: bool = False, rate_hz: float = RATE_HZ
+    ) -> None:
+        super().__init__(far_hz=far_hz, peers=(1, 2, 3), rate_hz=rate_hz)
         self.others = {agent: self.hub.connect(agent_name(agent)) for agent in places}
         self.alive |= {agent_name(agent) for agent in places}
         self.places, self.count = places, 0
@@ -97,6 +101,15 @@ def test_a_silent_near_one_is_evaded_where_most_are_heard_though_they_are_far(fa
     agent = Amid(far_hz, places, far=bool(far_hz) and away_m > 20.0)
     agent.fly(2.0, each=agent.all_speak)
     assert agent.evasions_while_the_peer_is_silent(0.6) >= 1
+
+
+@pytest.mark.parametrize(("rate_hz", "evades"), [(50.0, True), (10.0, False)])
+def test_one_of_slow_ticks_whose_last_two_messages_were_lost_is_not_silent(rate_hz: float, evades: bool) -> None:
+    """At 50 Hz so long a silence is of ten."""
+    agent = Amid(0.0, {2: np.array([8.0, 2.0, 0.0]), 3: np.array([-8.0, 2.0, 0.0])}, rate_hz=rate_hz)
+    agent.fly(3.0, each=agent.all_speak)
+    assert (agent.evasions_while_the_peer_is_silent(0.3) > 0) is evades
+    assert agent.evasions_while_the_peer_is_silent(0.6) > 0 or evades
 
 
 def test_control_who_hears_nobody_may_be_cut_off_and_evades_nothing() -> None:

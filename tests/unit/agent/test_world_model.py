@@ -56,6 +56,8 @@ class Bench:
     events: list[dict[str, Any]] = field(default_factory=list)
     seq: int = 0
     quorum: int = 1
+    rate_hz: float = 50.0
+    heartbeat_s: float = 0.1
     connect: Callable[[LocalHub, str], Bus] = LocalHub.connect
 
     def __post_init__(self) -> None:
@@ -70,7 +72,8 @@ class Bench:
             SeparationParams(),
             self.bus,
             utc_us=self.clock.utc_us,
-            rate_hz=50.0,
+            rate_hz=self.rate_hz,
+            heartbeat_s=self.heartbeat_s,
             note=note,
             vouchers=vouchers,
             quorum=self.quorum,
@@ -837,3 +840,19 @@ def test_only_vehicles_that_agents_fly_miss_their_setpoints(mode: Mode, agents: 
     assert list(ways) == expected
     for points in ways.values():
         np.testing.assert_allclose(points, np.tile(HERE, (6, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "heartbeat_s", "age_s", "ways"),
+    [(50.0, 0.1, 0.14, 1), (50.0, 0.1, 0.18, 2), (50.0, 0.25, 0.3, 1), (10.0, 0.1, 0.3, 1), (10.0, 0.1, 0.42, 2)],
+)
+def test_a_peer_is_expected_without_setpoints_too_once_its_path_is_late(
+    rate_hz: float, heartbeat_s: float, age_s: float, ways: int
+) -> None:
+    bench = Bench(rate_hz=rate_hz, heartbeat_s=heartbeat_s)
+    bench.say_path()
+    bench.say_status(mode=Mode.TRACKING, phase=Phase.TRACK)
+    bench.tick()
+    bench.clock.advance(round(1e6 * age_s) - TICK_US)
+    (path,) = bench.world_model.paths.latest()
+    assert len(bench.world_model._ways(path, bench.clock.utc_us())) == ways
