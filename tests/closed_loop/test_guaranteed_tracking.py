@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from swarmctl.agent.planning import coordination
+from swarmctl.agent.planning import commitment_tracking
 from swarmctl.agent.planning.separation_policy import Guaranteed
 from swarmctl.agent.planning.state_age import StateAge
 from swarmctl.config import load
@@ -73,7 +73,7 @@ def test_a_vehicle_that_is_held_up_slows_and_does_not_chase_what_it_had_committe
 
 def test_negative_control_commitments_that_go_on_in_time_are_chased(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Commitments, "wait_for", lambda self, *_: None)
-    monkeypatch.setattr(coordination, "slowed", lambda desired, *_: desired)
+    monkeypatch.setattr(commitment_tracking, "slowed", lambda desired, *_: desired)
     off_m, fastest_m_s = HeldUp().fly()
     assert off_m > 0.35
     assert fastest_m_s > 2.3

@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from swarmctl.agent.planning.commitment_publisher import CommitmentPublisher
+from swarmctl.agent.planning.commitment_tracking import CommitmentTracking
 from swarmctl.agent.planning.non_participants import NonParticipants, most_are_heard
 from swarmctl.agent.planning.unanswered_proposals import UnansweredProposals
 from swarmctl.agent.sensing.deviations import Deviations
@@ -22,12 +23,12 @@ from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments
 from swarmctl.control.commit.reach import FarPeers
-from swarmctl.control.commit.situation import DesiredReference, Situation, slowed
+from swarmctl.control.commit.situation import DesiredReference, Situation
 from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
-from swarmctl.control.commit.tube import Grip, Tube
+from swarmctl.control.commit.tube import Grip
 from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
-from swarmctl.core.types import MAX_MARGIN_M, Array, Phase, VehicleState
+from swarmctl.core.types import Array, Phase, VehicleState
 
 _SUSPECT_US = 5_000_000  # without a message, after which a peer is suspected: bursts of loss end sooner
 _SILENT_PERIODS, _SILENT_US = 4, 160_000  # so many messages have not come, at the least
@@ -54,9 +55,8 @@ class Coordination:
         far_peers: chooses the peers whose acknowledgements can be done without.
         far_hz: how often those are told; 0: nobody is far.
         note: is told `conflicting_commitment` when a peer's committed trajectory comes too close to the own one;
-            `tracking_violation` when the vehicle leaves its tube, when that has another consequence, and when it is
-            held again; `membership` when the peers that are suspected, promised to be excluded, or excluded change;
-            and `commitments` with all counts when the autopilot or a pilot takes over.
+            `membership` when the peers that are suspected, promised to be excluded, or excluded change; `commitments`
+            with all counts when the autopilot or a pilot takes over; and what `CommitmentTracking` tells.
 
     Attributes:
         committed_peers: by agent number, the trajectories that each peer within reach may follow, if it is relied on. A
@@ -102,8 +102,7 @@ class Coordination:
         self._non_participants = NonParticipants(world_model, separation, dt_us=planner.dt_us, steps=planner.steps)
         self._is_committed = False
         self._tube_m = separation.budget.tube_m
-        self._tube = Tube(self._tube_m)
-        self._grip, self._error_m = Grip.HELD, 0.0
+        self._tracking = CommitmentTracking(self._commitments, self._tube_m, note)
         self._entered_now, self._entered_ahead = Encounters(), Encounters()  # where a plan begins now, or ahead
         self._silent_us = max(_SILENT_US, round(_SILENT_PERIODS * 1e6 / rate_hz))
         self._far_silent_us = round(_FAR_PERIODS * 1e6 / far_hz) if far_hz else self._silent_us
@@ -128,7 +127,7 @@ class Coordination:
     @property
     def worst_tracking_m(self) -> float:
         """Return how far the vehicle has been off what it had committed to, at most."""
-        return self._tube.worst_m
+        return self._tracking.worst_m
 
     def receive(self, utc_us: int) -> None:
         """Apply rule 1: take in every message that has arrived, and what it says about silent peers."""
@@ -197,7 +196,7 @@ class Coordination:
             self._begun_us = utc_us
             commitments.begin(state.pos_ned_m, state.vel_ned_m_s, state_utc_us)
         since_us, self._stepped_us = utc_us - self._stepped_us, utc_us
-        self._watch(utc_us, since_us, state, state_utc_us)
+        self._tracking.watch(utc_us, since_us, state, state_utc_us)
         required, newest = self._required_peers(), self._peer_trajectories.newest
         known = self._near_messages()
         asked, near = required - self._still_spared(utc_us), self._far_peers.near
@@ -210,7 +209,7 @@ class Coordination:
         now = Situation(
             utc_us=utc_us,
             begin_us=utc_us,
-            desired=self._paced(desired, begin_us),
+            desired=self._tracking.paced(desired, begin_us),
             peers={agent: known[agent] for agent in relied_on},
             others=self._others(utc_us, state, phase, relied_on, self._entered_now),
             disturbance_ned_m_s2=disturbance_ned_m_s2,
@@ -219,7 +218,7 @@ class Coordination:
         self._evade_silent(replace(now, peers=known), relied_on)
         unsure = {a for a in required & near if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
         self.alert = self._why_slow(unsure, utc_us)
-        if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
+        if commitments.is_due(utc_us) and self._tracking.grip < Grip.STOPPED and not unsure:
             heard = (relied_on & required) - self._absent()
             others = self._others(begin_us, state, phase, heard, self._entered_ahead)
             commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
@@ -320,7 +319,7 @@ class Coordination:
             is_committed=self._is_committed,
             committed=committed,
             proposal=proposal,
-            tube_m=max(self._tube.radius_m, min(MAX_MARGIN_M, self._error_m + unsure_m)),
+            tube_m=self._tracking.told_m(unsure_m),
             exclusions=exclusions,
             reach=self._far_peers.reach(
                 commitments.trajectories,
@@ -336,36 +335,12 @@ class Coordination:
     @property
     def is_held(self) -> bool:
         """Return whether the vehicle is within the tube around what it has committed to."""
-        return self._is_committed and self._grip is Grip.HELD
+        return self._is_committed and self._tracking.grip is Grip.HELD
 
     @property
     def margin_m(self) -> float:
         """Return by how much the own tube is wider than distances leave room for."""
-        return self._tube.radius_m - self._tube_m
-
-    def _paced(self, desired: DesiredReference, begin_us: int) -> DesiredReference:
-        """Return the desired motion, or a slower one from where the next plan begins while the tube is left far."""
-        if self._tube.pace_01 == 1.0:
-            return desired
-        assert self._commitments.flown is not None
-        return slowed(desired, np.array(self._commitments.flown.at(begin_us)[0]), self._tube.pace_01)
-
-    def _watch(self, utc_us: int, since_us: int, state: VehicleState, state_utc_us: int) -> None:
-        """Commit anew, from the measured state, when the commitment is lost; report how well it is held."""
-        commitments = self._commitments
-        commitments.wait_for(state.pos_ned_m, state_utc_us, since_us, self._tube_m)
-        assert commitments.committed is not None and commitments.flown is not None
-        state_utc_us = max(state_utc_us, commitments.committed.t0_utc_us)  # before it begins it is as if at rest
-        pos, vel = map(np.array, commitments.committed.at(state_utc_us))
-        self._error_m = error_m = float(np.linalg.norm(state.pos_ned_m - pos))
-        error_m_s = float(np.linalg.norm(state.vel_ned_m_s - vel))
-        late_m = math.dist(pos, commitments.flown.at(state_utc_us)[0])
-        if self._tube.update(utc_us, error_m, error_m_s, late_m):
-            commitments.restart(state.pos_ned_m, state.vel_ned_m_s, state_utc_us)
-        before, self._grip = self._grip, self._tube.grip(utc_us)
-        if self._grip is not before:
-            is_off, grip = self._grip is not Grip.HELD, self._grip.name
-            self._note("tracking_violation", begins=is_off, error_m=error_m, allowed_m=self._tube_m, grip=grip)
+        return self._tracking.margin_m
 
     def _required_peers(self) -> frozenset[int]:
         """Return peers that fly by commitments and have to acknowledge what they are not spared.
@@ -384,15 +359,15 @@ class Coordination:
         return {agent for agent in self._peers if agent_name(agent) not in alive}
 
     def _why_slow(self, unsure: Set[int], utc_us: int) -> str:
-        if self._grip > Grip.OUTSIDE:
-            return f"blown off what it had committed to: {self._grip.name.lower()}"
+        if self._tracking.grip > Grip.OUTSIDE:
+            return f"blown off what it had committed to: {self._tracking.grip.name.lower()}"
         if unsure:
             return f"the clock of {_names(unsure)} is not known well enough"
         deaf = self._unanswered.by(utc_us) - self._peer_trajectories.silent(self._peers, utc_us, _SUSPECT_US)
         return f"{_names(deaf)} answers no proposal, and may take it for ended" if deaf else ""
 
     def _why_cut_off(self, utc_us: int, required: Set[int]) -> str:
-        if self._grip is Grip.LOST:
+        if self._tracking.grip is Grip.LOST:
             return "it can't hold what it commits to"
         if by := self._membership.excluded_by:
             return f"excluded by {_names(by)} after silence"
