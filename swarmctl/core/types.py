@@ -19,6 +19,8 @@ from swarmctl.core.ordered_sums import dot
 Array = NDArray[np.float64]
 NO_AGE_US = -1  # of what there is none yet
 MAX_MARGIN_M = 10.0  # limit of the margin in a path, so that one peer cannot ground all others
+MIN_STEP_US, MAX_STEP_US = 1_000, 500_000  # between points of what a peer says to fly; as `dt_s` of controllers
+MAX_SPEED_M_S = 500.0  # along each axis, of what a peer says to fly: what is looked at grows with it
 Sampled = Callable[[Array], tuple[Array, Array]]  # offsets (K,) [s] from now -> positions, velocities, (K, 3) each
 
 

@@ -16,7 +16,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.messages.commitment_messages import decode_trajectory_message, encode_trajectory_message
 from swarmctl.bus.messages.json_messages import CommandMessage, decode_status, encode_message
-from swarmctl.bus.messages.path_messages import encode_path
+from swarmctl.bus.messages.path_messages import decode_path, encode_path
 from swarmctl.bus.peers.senders import ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.core.types import Mode, Phase
 from swarmctl.telemetry.evaluation.referee import RunData, evaluate
@@ -180,6 +180,38 @@ def test_permanent_forgery_is_reported_and_distances_are_kept(fly: Fly, twin: Fl
 def test_late_and_lost_messages_raise_no_forgery_alarm(fly: Fly) -> None:
     flight = swap(fly, "bus.delay_ms=300", "bus.loss_01=0.2")
     assert not [violation for violation in summary(flight)["violations"] if "refused" in violation]
+
+
+def falls_silent(lie: Callable[[bytes], bytes] | None) -> Callable[[Lockstep], None]:
+    """Let the victim's paths reach nobody any more; the last one that would have is changed first."""
+
+    def tap(running: Lockstep) -> None:
+        carry, lies = running.hub.carry, [lie] if lie else []
+
+        def last_words(sender: str, of: topics.Topic, payload: bytes) -> None:
+            if sender != agent_name(VICTIM) or of is not topics.PATH:
+                carry(sender, of, payload)
+            elif lies:
+                carry(sender, of, lies.pop()(payload))
+
+        running.hub.carry = last_words  # type: ignore[method-assign, assignment]
+
+    return tap
+
+
+def in_microseconds(payload: bytes) -> bytes:
+    path = decode_path(payload)
+    assert path is not None
+    return encode_path(replace(path, dt_us=1))
+
+
+def test_a_peer_that_says_points_of_microseconds_and_falls_silent_is_merely_silent(fly: Fly) -> None:
+    """Others looked at 2.5 million points of it in each of their ticks, which took 0.9 s."""
+    told = swap(fly, at={FORGED_S: falls_silent(in_microseconds)}, until_s=2.5)
+    silent = swap(fly, at={FORGED_S: falls_silent(None)}, until_s=2.5)
+    np.testing.assert_array_equal(told.pos_ned_m, silent.pos_ned_m)
+    rejected = [agent.rejected.get("malformed", 0) for agent in told.lockstep.agents if agent is not None]
+    assert rejected == [1, 0, 1, 1]
 
 
 def test_commands_with_old_or_future_stamps_are_refused_and_the_last_one_counts(fly: Fly) -> None:

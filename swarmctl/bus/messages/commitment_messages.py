@@ -7,6 +7,7 @@ and of those that are far. A trajectory is t0, step and count, then positions an
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import ItemsView, Iterator, Mapping
 from functools import cached_property, lru_cache
@@ -15,12 +16,11 @@ import numpy as np
 
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Exclusions, Proposal, Reach, TrajectoryMessage
-from swarmctl.core.types import Array
+from swarmctl.core.types import MAX_SPEED_M_S, MAX_STEP_US, MIN_STEP_US, Array
 
 TRAJECTORY_VERSION = 5
 MAX_TUBE_M = 100.0
 MAX_POINTS = 2000
-MAX_STEP_US = 500_000
 MAX_PEERS = 256  # of each kind: acknowledged, heard, suspected, promised, far
 _MAGIC = b"SI"
 _HEADER = struct.Struct("<2sBBIIIqfffHHHHH")  # magic version flags agent boot seq sent tube reach, counts of the kinds
@@ -248,15 +248,18 @@ def _decode_trajectory(body: bytes) -> Trajectory:
     """Return a trajectory by its sender's clock; messages repeat it until the next one.
 
     Raises:
-        ValueError: the bytes are no trajectory.
+        ValueError: the bytes are no trajectory, or one that no vehicle flies.
     """
     t0_utc_us, dt_us, count = _TRAJECTORY.unpack_from(body)
     is_whole = len(body) == _TRAJECTORY.size + _POINT_BYTES * count
-    if not 2 <= count <= MAX_POINTS or not 0 < dt_us <= MAX_STEP_US or not is_whole:
+    if not 2 <= count <= MAX_POINTS or not MIN_STEP_US <= dt_us <= MAX_STEP_US or not is_whole:
         raise ValueError("no trajectory")
     points: Array = np.frombuffer(body, "<f4", 6 * count, _TRAJECTORY.size).reshape(count, 6).astype(np.float64)
-    if not np.isfinite(points).all():
+    if not math.isfinite(np.vdot(points, points)):  # squares can't overflow
         raise ValueError("not finite")
     pos_ned_m, vel_ned_m_s = points[:, :3].copy(), points[:, 3:].copy()
+    farthest_m = 1e-6 * MAX_SPEED_M_S * dt_us
+    if np.abs(vel_ned_m_s).max() > MAX_SPEED_M_S or np.abs(pos_ned_m[1:] - pos_ned_m[:-1]).max() > farthest_m:
+        raise ValueError("too fast")
     pos_ned_m.flags.writeable = vel_ned_m_s.flags.writeable = False  # of all agents of a process
     return Trajectory(t0_utc_us=t0_utc_us, dt_us=dt_us, pos_ned_m=pos_ned_m, vel_ned_m_s=vel_ned_m_s)

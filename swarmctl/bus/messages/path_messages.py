@@ -15,7 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from swarmctl.core.types import MAX_MARGIN_M, Array, PredictedPath
+from swarmctl.core.types import MAX_MARGIN_M, MAX_SPEED_M_S, MAX_STEP_US, MIN_STEP_US, Array, PredictedPath
 
 FLOAT_VERSION = 3
 COMPACT_VERSION = 4
@@ -35,6 +35,7 @@ _HAS_SETPOINT = 1  # flag
 _PER_M_S2 = 1024.0  # units of accelerations; 32 m/s2 are the most
 _MOST_ACCEL = 32767
 _NO_ACCEL = (0, 0, 0)
+_FARTHEST_M_US = 1e-6 * MAX_SPEED_M_S
 _ROUNDING_01 = 0.5 * math.sqrt(3.0)  # largest distance, in units, of a point from its rounded one
 
 
@@ -104,7 +105,7 @@ def stamp_us(payload: bytes) -> int:
 
 @lru_cache(maxsize=_REMEMBERED)
 def decode_path(payload: bytes) -> PredictedPath | None:
-    """Decode a path; None unless magic, version, lengths and all numbers are valid.
+    """Decode a path; None unless magic, version, lengths and all numbers are valid, and a vehicle might fly it.
 
     All agents of a process that hear it share the result, whose points are read-only.
     """
@@ -113,9 +114,9 @@ def decode_path(payload: bytes) -> PredictedPath | None:
     (magic, version, flags, agent, boot_id, seq, t0_utc_us, dt_us, margin_m, count, header_len, exponent, *accel) = (
         _HEADER.unpack_from(payload)
     )
-    if magic != _MAGIC or header_len < _HEADER.size or dt_us <= 0 or not 2 <= count <= MAX_POINTS:
+    if magic != _MAGIC or header_len < _HEADER.size or not 2 <= count <= MAX_POINTS:
         return None
-    if not (math.isfinite(margin_m) and 0.0 <= margin_m <= MAX_MARGIN_M):
+    if not (MIN_STEP_US <= dt_us <= MAX_STEP_US and math.isfinite(margin_m) and 0.0 <= margin_m <= MAX_MARGIN_M):
         return None
     if version == FLOAT_VERSION:
         pos_ned_m = _points(payload[header_len:], count)
@@ -123,7 +124,7 @@ def decode_path(payload: bytes) -> PredictedPath | None:
         pos_ned_m = _compact_points(payload[header_len:], count, exponent)
     else:
         return None
-    if pos_ned_m is None:
+    if pos_ned_m is None or _is_too_fast(pos_ned_m, dt_us):
         return None
     pos_ned_m.flags.writeable = False
     return PredictedPath(
@@ -154,6 +155,13 @@ def _points(body: bytes, count: int) -> Array | None:
         return None
     numbers = np.frombuffer(body, _NUMBER).astype(np.float64)
     return numbers.reshape(count, 3) if math.isfinite(numbers @ numbers) else None  # squares can't overflow
+
+
+def _is_too_fast(pos_ned_m: Array, dt_us: int) -> bool:
+    steps_m, most_m = pos_ned_m[1:] - pos_ned_m[:-1], _FARTHEST_M_US * dt_us
+    if np.vdot(steps_m, steps_m) <= most_m * most_m:  # as nearly always; half the time of looking at each of them
+        return False
+    return bool(np.abs(steps_m).max() > most_m)
 
 
 def _compact_points(body: bytes, count: int, exponent: int) -> Array | None:

@@ -61,5 +61,5 @@ def places_apart_m(own: Trajectory, begin_us: int, known: Sequence[Trajectory], 
 def _places(trajectory: Trajectory, from_us: int) -> Array:
     """Return places (M, 3) that a trajectory passes from a time on, close to each other, with its end."""
     fastest_m_s = math.sqrt(float(np.einsum("kc,kc->k", trajectory.vel_ned_m_s, trajectory.vel_ned_m_s).max()))
-    step_us = min(_LONGEST_US, round(1e6 * _APART_M / max(fastest_m_s, 1e-3)))
+    step_us = min(_LONGEST_US, max(1, round(1e6 * _APART_M / max(fastest_m_s, 1e-3))))
     return trajectory.sample(np.append(np.arange(from_us, trajectory.end_utc_us, step_us), trajectory.end_utc_us))[0]

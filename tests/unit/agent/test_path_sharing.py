@@ -167,3 +167,11 @@ def test_peers_keep_the_error_more() -> None:
 
 def test_a_path_from_before_the_shared_one_is_shared() -> None:
     assert shared(BY_EVENT, path(3), path(1)) == [3, 1], "a clock was set back"
+
+
+def test_a_path_too_fast_for_peers_is_told_and_not_taken_for_known() -> None:
+    """An estimate that has run away must not end its agent."""
+    ran_away = replace(path(0), pos_ned_m=np.outer(np.arange(41), [12.0, 0.0, 0.0]))
+    sharing = PathSharing(BY_EVENT, SEPARATION)
+    assert sharing.message(ran_away) is not None
+    assert read(sharing.message(path(1))) is not None, "peers know of no path"

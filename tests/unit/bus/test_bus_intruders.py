@@ -158,8 +158,8 @@ class Scene:
         self.numbers[agent_name(agent)] += 1
         return self.numbers[agent_name(agent)]
 
-    def path(self, agent: int = 1, boot_id: int = BOOT) -> bytes:
-        of = {"agent": agent, "boot_id": boot_id, "seq": self.number(agent), "t0_utc_us": self.now_us}
+    def path(self, agent: int = 1, boot_id: int = BOOT, **fields: int) -> bytes:
+        of = {"agent": agent, "boot_id": boot_id, "seq": self.number(agent), "t0_utc_us": self.now_us, **fields}
         return encode_path(builders.predicted_path(pos_ned_m=POINTS, **of))
 
     def status(self, phase: Phase = Phase.TRACK, boot_id: int = BOOT) -> bytes:
@@ -207,7 +207,7 @@ def changed(change: Callable[[bytearray, Scene], None], topic: Topic = PATH, sen
     """Hold back the victim's next message, and deliver it changed."""
 
     def attack(scene: Scene) -> None:
-        payload = {PATH: scene.path, STATUS: scene.status}[topic]()
+        payload = scene.path() if topic is PATH else scene.status()
         message = bytearray(scene.victim.seal(topic.name, payload, scene.now_us))
         change(message, scene)
         scene.carry(sender, topic, bytes(message))
@@ -385,6 +385,11 @@ ROWS = {
     "from the future": Row(attack=_from_the_future, reasons={"future"}, by_seal=False),
     "about another agent, in the own name": Row(
         attack=sealed_by("charlie", OTHER, PATH, path_of(1)), reasons={"identity"}, by_seal=False
+    ),
+    "a path of a million points a second": Row(
+        attack=lambda scene: scene.carry(VICTIM, PATH, scene.victim.seal(PATH.name, scene.path(dt_us=1), scene.now_us)),
+        reasons={"malformed"},
+        by_seal=False,
     ),
     "3 MB": Row(attack=sealed_by("charlie", OTHER, PATH, megabytes), reasons={"malformed"}, by_seal=False),
     "6000 obstacles": Row(

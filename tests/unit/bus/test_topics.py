@@ -38,7 +38,7 @@ from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order, Ve
 from swarmctl.core.recorded.records import TICK_DTYPE
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Exclusions, Proposal
-from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
+from swarmctl.core.types import MAX_MARGIN_M, MAX_SPEED_M_S, MAX_STEP_US, MIN_STEP_US, PredictedPath
 from tests import builders
 
 POINTS = np.array([[1.5, -2.25, -3.0], [1.625, -2.0, -3.5], [1.75, -1.75, -4.0]])
@@ -140,6 +140,10 @@ def test_a_number_that_is_not_finite_is_refused(number: int, bad: float) -> None
         changed(2, "<B", 5),  # a version from the future
         changed(24, "<i", 0),  # dt
         changed(24, "<i", -20_000),
+        changed(24, "<i", MIN_STEP_US - 1),
+        changed(24, "<i", MAX_STEP_US + 1),
+        changed(42 + 3 * 4, "<f", POINTS[0, 0] + 1.01 * MAX_SPEED_M_S * 0.02),  # in the second point
+        changed(42 + 8 * 4, "<f", POINTS[1, 2] - 1.01 * MAX_SPEED_M_S * 0.02),
         changed(28, "<f", math.nan),  # radius
         changed(28, "<f", math.inf),
         changed(28, "<f", -0.5),
@@ -378,11 +382,11 @@ def test_lists_and_numbers_from_outside_are_bounded() -> None:
 
 def test_the_longest_good_message_of_every_topic_fits() -> None:
     path = builders.predicted_path(
-        agent=0, boot_id=0, seq=0, dt_us=1, pos_ned_m=np.zeros((path_messages.MAX_POINTS, 3))
+        agent=0, boot_id=0, seq=0, dt_us=MIN_STEP_US, pos_ned_m=np.zeros((path_messages.MAX_POINTS, 3))
     )
     assert len(encode_path(path)) <= topics.PATH.max_bytes
     trajectory = Trajectory(
-        t0_utc_us=0, dt_us=1, pos_ned_m=np.zeros((MAX_POINTS, 3)), vel_ned_m_s=np.zeros((MAX_POINTS, 3))
+        t0_utc_us=0, dt_us=MIN_STEP_US, pos_ned_m=np.zeros((MAX_POINTS, 3)), vel_ned_m_s=np.zeros((MAX_POINTS, 3))
     )
     acknowledged = dict.fromkeys(range(MAX_PEERS), 2**60)
     message = builders.trajectory_message(

@@ -144,6 +144,18 @@ def test_of_two_one_leaves_its_places_before_a_vehicle_that_comes_along_them() -
     assert closest_m(leaves, COMES) >= HARD_MIN_M
 
 
+def test_places_of_the_fastest_are_looked_at_every_microsecond_at_most() -> None:
+    """A step of no time would be divided by."""
+    own = straight((0.0, 0.0), 0.0)
+    fastest = Trajectory(
+        t0_utc_us=UTC_US,
+        dt_us=1_000,
+        pos_ned_m=np.zeros((2, 3)),
+        vel_ned_m_s=np.array([[1e9, 0.0, 0.0], [0.0, 0.0, 0.0]]),
+    )
+    assert math.isfinite(places_apart_m(own, UTC_US, [fastest], UTC_US, 1.0))
+
+
 def closest_m(agent: Commitments, vehicle: Array) -> float:
     """Return the least distance of what an agent is committed to from a vehicle, at the same times."""
     assert agent.committed is not None

@@ -14,7 +14,6 @@ from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.messages.commitment_messages import (
     MAX_PEERS,
     MAX_POINTS,
-    MAX_STEP_US,
     decode_trajectory_message,
     encode_trajectory_message,
 )
@@ -26,6 +25,7 @@ from swarmctl.control.commit.protocol import acknowledgements
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
 from swarmctl.core.trajectory_message import Exclusions, Proposal, Reach, TrajectoryMessage
+from swarmctl.core.types import MAX_SPEED_M_S, MAX_STEP_US, MIN_STEP_US
 from tests import builders
 
 UTC_US = 1_700_000_000_000_000
@@ -133,12 +133,16 @@ FLAGS, TUBE, STEP, POINTS = 3, 24, 54, 62  # offsets: of the header's flags and 
         (TUBE, "<f", 0.0, True),
         (TUBE, "<f", 100.0, True),
         *((TUBE, "<f", bad, False) for bad in (-0.1, 101.0, math.nan, math.inf)),
-        (STEP, "<i", 1, True),
+        (STEP, "<i", MIN_STEP_US, True),
+        (STEP, "<i", MIN_STEP_US - 1, False),
+        (STEP, "<i", 1, False),
         (STEP, "<i", MAX_STEP_US, True),
         (STEP, "<i", 0, False),
         (STEP, "<i", -100_000, False),
         (STEP, "<i", MAX_STEP_US + 1, False),
-        (POINTS, "<f", 1e6, True),
+        (POINTS, "<f", 1e6, False),  # it would jump there
+        *((POINTS + 4 * k, "<f", sign * MAX_SPEED_M_S, True) for k in (3, 4, 5) for sign in (1.0, -1.0)),
+        *((POINTS + 4 * k, "<f", sign * 501.0, False) for k in (3, 4, 5) for sign in (1.0, -1.0)),
         *((POINTS + 4 * k, "<f", bad, False) for k in range(6) for bad in (math.nan, math.inf, -math.inf)),
     ],
 )
