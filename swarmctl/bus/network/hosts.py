@@ -38,8 +38,8 @@ def host_problems(hosts: Sequence[HostParams], agents: int) -> Iterator[str]:
     if len(hosts) > MOST_HOSTS:
         yield f"hosts: {len(hosts)} are listed; largest allowed: {MOST_HOSTS}; let several agents share a computer"
     yield from _clashes(hosts)
-    for key, values in (("name", [h.name for h in hosts]), ("address", [h.address for h in hosts])):
-        yield from (f"hosts: {key} {value!r} is given {n} times" for value, n in Counter(values).items() if n > 1)
+    names = Counter(host.name for host in hosts)
+    yield from (f"hosts: name {name!r} is given {n} times" for name, n in names.items() if n > 1)
     counts = Counter(agent for host in hosts for agent in host.agents)
     if hosts and (missing := [agent for agent in range(agents) if not counts[agent]]):
         yield f"hosts: agents {missing} run nowhere; list each of swarm.agents = {agents} at one host"
@@ -49,13 +49,21 @@ def host_problems(hosts: Sequence[HostParams], agents: int) -> Iterator[str]:
 
 
 def _clashes(hosts: Sequence[HostParams]) -> Iterator[str]:
-    """Yield where datagrams, which go to the port after that of an address, would meet something else."""
-    places = {split_address(host.address): host.name for host in hosts if not _address_problem(host.address)}
+    """Yield addresses that are one, and where datagrams, which go to the port after, would meet something else."""
+    valid = [host for host in hosts if not _address_problem(host.address)]
+    counts = Counter(split_address(host.address) for host in valid)  # one address has several spellings
+    yield from (f"hosts: address {_spelt(place)!r} is given {n} times" for place, n in counts.items() if n > 1)
+    places = {split_address(host.address): host.name for host in valid}
     for (ip, port), name in places.items():
         if other := places.get((ip, port + 1)):
             yield f"hosts: port {port + 1} of {ip} is {other}'s and that of datagrams to {name}; leave one port between"
     if len({ip.version for ip, _ in places}) > 1:
         yield "hosts: addresses are of IPv4 and of IPv6; use one kind for all"
+
+
+def _spelt(place: tuple[ipaddress.IPv4Address | ipaddress.IPv6Address, int]) -> str:
+    ip, port = place
+    return f"[{ip}]:{port}" if ip.version == 6 else f"{ip}:{port}"
 
 
 def roster_of(hosts: Sequence[HostParams], *, relay: bool) -> Roster:

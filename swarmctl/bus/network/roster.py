@@ -109,9 +109,15 @@ def split_address(address: str) -> tuple[ipaddress.IPv4Address | ipaddress.IPv6A
     """Return IP and port of `IP:PORT`; IPv6 is in brackets, and the port has a next one, for datagrams.
 
     Raises:
-        ValueError: it is not of this form.
+        ValueError: it is not of this form, or no computer is at this address.
     """
-    ip, _, port = address.rpartition(":")
+    written, _, port = address.rpartition(":")
     if not port.isascii() or not port.isdigit() or not 0 < int(port) < 65535:
         raise ValueError(f"{port!r} is no port from 1 to 65534")
-    return ipaddress.ip_address(ip.removeprefix("[").removesuffix("]")), int(port)
+    is_bracketed = written.startswith("[") and written.endswith("]")
+    ip = ipaddress.ip_address(written[1:-1] if is_bracketed else written)
+    if is_bracketed is not (ip.version == 6):
+        raise ValueError("an IPv6 address is in brackets, an IPv4 address is not")
+    if ip.is_unspecified or ip.is_multicast or getattr(ip, "scope_id", None):
+        raise ValueError(f"{ip} is not the address of one computer, the same for all others")
+    return ip, int(port)

@@ -29,6 +29,7 @@ from swarmctl.ops.flight.host import (
 ROOT = Path(__file__).parents[3]
 CONFIG = ROOT / "configs" / "three_hosts.toml"
 ALPHA = "hosts.0."
+NOWHERE = ("0.0.0.0", "224.0.0.1", "[::]", "[ff02::1]", "[fe80::1%eth0]")
 
 
 @pytest.fixture
@@ -54,6 +55,11 @@ def path(tmp_path: Path) -> Path:
         (ALPHA + "address='10.20.0.1:65535'", "no port from 1 to 65534"),
         (ALPHA + "address='10.20.0.2:7447'", "port 7448 of 10.20.0.2 is bravo's and that of datagrams to alpha"),
         (ALPHA + "address='[fd00::1]:7448'", "use one kind for all"),
+        (ALPHA + "address='10.20.0.2:07448'", "address '10.20.0.2:7448' is given 2 times"),
+        (ALPHA + "address='[10.20.0.1]:7448'", "an IPv6 address is in brackets, an IPv4 address is not"),
+        (ALPHA + "address='[10.20.0.1:7448'", "write IP:PORT"),
+        (ALPHA + "address='fd00::1:7448'", "an IPv6 address is in brackets, an IPv4 address is not"),
+        *((ALPHA + f"address='{ip}:7448'", "not the address of one computer") for ip in NOWHERE),
         (ALPHA + "name='bravo'", "given 2 times"),
         (ALPHA + "name='station'", "reserved"),
         (ALPHA + "name='a/b'", "hosts.0.name"),
