@@ -17,7 +17,9 @@ from swarmctl.bus.topics import Topic
 from swarmctl.bus.zenoh.bus import ZenohBus
 from swarmctl.bus.zenoh.client import SCHEME
 
-LOOPBACK = ipaddress.ip_address("127.0.0.1")
+LOOPBACK, LOOPBACK_6 = ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("::1")
+
+Ip = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +39,14 @@ class SwarmOfHosts:
     places: dict[str, Path] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, folder: Path, ports: Sequence[int] = (1, 2, 3), *, relay: bool = False) -> SwarmOfHosts:
+    def of(
+        cls, folder: Path, ports: Sequence[int] = (1, 2, 3), *, relay: bool = False, at: Ip = LOOPBACK
+    ) -> SwarmOfHosts:
         """Return a swarm with the identities of a folder, which are made apart."""
+        ip = f"[{at}]" if at.version == 6 else at
         names = ("alpha", "bravo", "charlie")
         hosts = tuple(
-            HostParams(name=name, address=f"127.0.0.1:{port}", agents=(number,), operator=name == "alpha")
+            HostParams(name=name, address=f"{ip}:{port}", agents=(number,), operator=name == "alpha")
             for number, (name, port) in enumerate(zip(names, ports, strict=True))
         )
         return cls(folder=folder, hosts=hosts, relay=relay)

@@ -29,7 +29,7 @@ from swarmctl.bus.zenoh.bus import ZenohBus
 from swarmctl.bus.zenoh.client import SCHEME
 from swarmctl.errors import StartError
 from tests.benches.free_ports import free_ports
-from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
+from tests.benches.swarm_of_hosts import LOOPBACK, LOOPBACK_6, Ip, SwarmOfHosts
 
 pytestmark = pytest.mark.process
 
@@ -48,6 +48,7 @@ MUTE = (
     "import swarmctl.bus.network.datagram_links as carried\n"
     "carried.DatagramLinks._send = carried.DatagramLinks._publish = lambda *_: None\n"
 )
+HASTY = "import swarmctl.bus.network.datagram_links as links; links._MISSED_S = links._LOOKED_EVERY_S = 0.5\n"
 WITHOUT_DATAGRAMS = ("-c", MUTE + RUN)
 ROGUE_WITHOUT_DATAGRAMS = ("-c", OPEN + MUTE + RUN)
 OF_BRAVO = {("bravo", "agent-1", "path"), ("bravo", "agent-1", "event"), ("bravo", "bravo", "ended")}
@@ -62,9 +63,19 @@ def swarm(tmp_path: Path) -> SwarmOfHosts:
     return new_swarm(tmp_path)
 
 
-def new_swarm(folder: Path, *, relay: bool = False) -> SwarmOfHosts:
-    make_identities(folder, {"alpha": LOOPBACK, "bravo": LOOPBACK, "charlie": LOOPBACK, STATION: None})
-    return SwarmOfHosts.of(folder, free_ports(3), relay=relay)
+def new_swarm(folder: Path, *, relay: bool = False, at: Ip = LOOPBACK) -> SwarmOfHosts:
+    make_identities(folder, {"alpha": at, "bravo": at, "charlie": at, STATION: None})
+    return SwarmOfHosts.of(folder, free_ports(3), relay=relay, at=at)
+
+
+def has(ip: Ip) -> bool:
+    """Return whether this computer has an address."""
+    with socket.socket(socket.AF_INET6 if ip.version == 6 else socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        try:
+            sock.bind((str(ip), 0))
+        except OSError:
+            return False
+    return True
 
 
 @contextmanager
@@ -111,7 +122,11 @@ def what_is_heard(swarm: SwarmOfHosts, by: tuple[str, ...], *, waits_for: dict[s
     return heard
 
 
-def test_an_identity_brings_what_is_its_own_only(swarm: SwarmOfHosts) -> None:
+@pytest.mark.parametrize(
+    "at", [LOOPBACK, pytest.param(LOOPBACK_6, marks=pytest.mark.skipif(not has(LOOPBACK_6), reason="no IPv6"))], ids=str
+)
+def test_an_identity_brings_what_is_its_own_only(at: Ip, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    swarm = new_swarm(tmp_path, at=at)
     own = {("charlie", "agent-2", "path"), ("charlie", "agent-2", "event"), ("charlie", "charlie", "ended")}
     kept = {("charlie", "charlie", "obstacles")}  # by which alpha, an operator's, knows what charlie keeps clear of
     operators = {("alpha", "alpha", topic) for topic in ("command", "mission", "obstacles")}
@@ -124,6 +139,21 @@ def test_an_identity_brings_what_is_its_own_only(swarm: SwarmOfHosts) -> None:
     assert {said for said in heard["bravo"] if said[0] == "alpha"} == of_alpha, "it has an operator's identity"
     assert {said for said in heard["alpha"] if said[0] == "alpha"} == of_alpha, "nor do clients on the host itself"
     assert {said for said in heard["alpha"] if said[0] == "bravo"} == OF_BRAVO, "it has none"
+    assert "no link" not in capfd.readouterr().err
+
+
+def test_a_router_says_whose_datagrams_come_without_a_link(
+    swarm: SwarmOfHosts, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """As where a firewall lets one of the two ports pass."""
+    alone = "import swarmctl.bus.network.router as router; router.link_endpoint = lambda _: 'quic/127.0.0.1:0'\n"
+    said, deadline_s = "", time.monotonic() + WAIT_S
+    with swarm.router("alpha", "-c", alone + HASTY + RUN), swarm.router("bravo", "-c", HASTY + RUN):
+        while not ("alpha: " in said and "bravo: " in said) and time.monotonic() < deadline_s:
+            time.sleep(0.1)
+            said += capfd.readouterr().err
+    assert "alpha: its datagrams come" in said and "bravo: its datagrams come" in said
+    assert "charlie" not in said, "it is off"
 
 
 def test_negative_control_without_access_control_it_brings_anything(swarm: SwarmOfHosts) -> None:

@@ -16,6 +16,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Set
 from typing import Any
 
 import zenoh
@@ -35,12 +36,31 @@ _TOLD_EVERY_S = 10.0
 _MOST_PUBLISHERS = 1024
 _MOST_WAITING = 256  # messages of one topic that wait to be sent; the oldest gives way
 _CLOSE_S = 1.0
+_LOOKED_EVERY_S = 1.0
+_MISSED_S = 5.0  # with datagrams and without a link; one that was cut is back in 3 s
 
 
 def datagram_address(address: str) -> Address:
     """Return where the datagrams to a router go that is at `IP:PORT`: to the next port."""
     ip, port = split_address(address)
     return str(ip), port + 1
+
+
+class MissedLinks:
+    """Tells which computers are heard by datagrams while no link with them comes up."""
+
+    def __init__(self) -> None:
+        self._since_s: dict[str, float] = {}
+        self._told: set[str] = set()
+
+    def update(self, heard: Set[str], linked: Set[str], now_s: float) -> tuple[str, ...]:
+        """Return whom to tell of now, each once until there is a link."""
+        missed = heard - linked
+        self._since_s = {name: self._since_s.get(name, now_s) for name in missed}
+        self._told -= linked
+        due = {name for name, since_s in self._since_s.items() if now_s - since_s >= _MISSED_S} - self._told
+        self._told |= due
+        return tuple(sorted(due))
 
 
 class DatagramLinks:
@@ -61,6 +81,7 @@ class DatagramLinks:
         self._publishers: dict[str, MarkedPublisher] = {}
         self._ends = threading.Event()
         self._told_s, self._told = time.monotonic(), 0
+        self._missed, self._looked_s = MissedLinks(), time.monotonic()
         subscribers = [
             session.declare_subscriber(
                 f"{_PREFIX}*/*/{topic.name}",
@@ -122,6 +143,7 @@ class DatagramLinks:
                     outgoing = self._routes.beat(now_s)
                 self._send_all(outgoing)
                 self._tell_refused(now_s)
+                self._tell_missed(now_s)
             self._receive()
 
     def _receive(self) -> None:
@@ -144,6 +166,23 @@ class DatagramLinks:
                     self._publishers.pop(next(iter(self._publishers))).undeclare()
                 publisher = self._publishers[key] = MarkedPublisher(self._session, key, reliable=False)
             publisher.put(payload)
+
+    def _tell_missed(self, now_s: float) -> None:
+        if now_s - self._looked_s < _LOOKED_EVERY_S:
+            return
+        self._looked_s = now_s
+        with contextlib.suppress(zenoh.ZError):  # the session is being closed
+            certified = [str(link.auth_identifier) for link in self._session.info.links()]
+            linked = {name.rpartition(".")[0] for name in certified}
+            with self._lock:
+                heard = self._routes.heard(now_s)
+            for name in self._missed.update(heard, linked, now_s):
+                print(
+                    f"{name}: its datagrams come, and for {_MISSED_S:g} s no link, so no orders, events and lists of "
+                    "obstacles. Let UDP at the port of the host's address pass, and compare the identities of both",
+                    file=sys.stderr,
+                    flush=True,
+                )
 
     def _tell_refused(self, now_s: float) -> None:
         refused = self._routes.refused.total()

@@ -80,7 +80,8 @@ class DatagramRoutes:
     def __init__(
         self, roster: Roster, me: str, keys: PairKeys, addresses: Mapping[str, Address], *, session: int
     ) -> None:
-        self._me = roster.names.index(me)
+        self._names = roster.names
+        self._me = self._names.index(me)
         self._relay = roster.relay
         self._own = frozenset(roster.speaker(me).senders)
         self._sealed_bytes = overhead_bytes(roster)
@@ -96,6 +97,10 @@ class DatagramRoutes:
             if place != self._me and key is not None
         }
         self.refused: Counter[str] = Counter()
+
+    def heard(self, now_s: float) -> frozenset[str]:
+        """Return the names of the computers that are heard directly."""
+        return frozenset(self._names[p] for p, link in self._links.items() if now_s - link.heard_s < HEARD_S)
 
     def send(self, key: str, payload: bytes, now_s: float) -> Outgoing:
         """Return the datagrams by which an own message reaches the others; none for one that is not carried.

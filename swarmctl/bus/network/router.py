@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import zenoh
 
 from swarmctl.bus.network.roster import identity_of_json
-from swarmctl.bus.network.router_links import RouterLinks
+from swarmctl.bus.network.router_links import RouterLinks, link_endpoint
 from swarmctl.bus.zenoh.client import CLOSE_DEADLINE_S, COMMON_SETTINGS, SCHEME, close_within, open_session, socket_file
 from swarmctl.errors import EXIT_OK, StartError, SwarmError
 from swarmctl.process_lifetime import die_with_parent, remove_socket
@@ -53,7 +53,7 @@ def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: boo
     """
     socket_path = _private_socket(endpoint)
     zenoh.init_log_from_env_or("error")
-    endpoints = [endpoint, *([f"quic/{links.listen}"] if links is not None and links.listen else [])]
+    endpoints = [endpoint, *([link_endpoint(links.listen)] if links is not None and links.listen else [])]
     settings = COMMON_SETTINGS | {"mode": "router", "listen/endpoints": endpoints, "scouting/delay": 0}
     link_settings, carry_datagrams = _linked(links)
     try:

@@ -9,9 +9,15 @@ from typing import Any
 
 from swarmctl.bus.network.access import access_settings
 from swarmctl.bus.network.identity_files import AUTHORITY, certificate_file, key_file
-from swarmctl.bus.network.roster import OwnIdentity
+from swarmctl.bus.network.roster import OwnIdentity, split_address
 
 LINK_LEASE_MS = 1500  # silence of another router after which its link counts as cut
+
+
+def link_endpoint(address: str) -> str:
+    """Return what Zenoh is told of `IP:PORT`: without brackets, with which it takes an IPv6 address for a name."""
+    ip, port = split_address(address)
+    return f"quic/{ip}:{port}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +45,7 @@ class RouterLinks:
             "transport/link/tls/enable_mtls": True,
             "transport/link/tls/verify_name_on_connect": True,
             "transport/link/tx/lease": LINK_LEASE_MS,
-            "connect/endpoints": [f"quic/{address}" for address in self.connect],
+            "connect/endpoints": [link_endpoint(address) for address in self.connect],
             "connect/timeout_ms": -1,
             "connect/exit_on_failure": False,
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},

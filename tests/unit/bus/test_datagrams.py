@@ -10,6 +10,7 @@ from itertools import combinations
 
 import pytest
 
+from swarmctl.bus.network.datagram_links import MissedLinks
 from swarmctl.bus.network.datagram_routes import BEAT_S, GONE_S, HEARD_S, TOO_LONG_TO_SEND, DatagramRoutes
 from swarmctl.bus.network.datagrams import MOST_DATAGRAM_BYTES, DatagramChannel, Opened, route_of
 from swarmctl.bus.network.hosts import HostParams, roster_of
@@ -327,6 +328,19 @@ def test_a_stranger_s_datagrams_are_counted_and_passed_on_to_nobody() -> None:
         taken = net.at["bravo"].take(datagram, ("10.0.0.66", 1), net.now_s)
         assert (taken.messages, taken.outgoing) == ((), [])
     assert net.at["bravo"].refused == Counter({MALFORMED: 1, FORGED: 2})
+
+
+def test_a_link_that_is_missed_for_seconds_is_told_of_once_and_again_after_there_was_one() -> None:
+    missed = MissedLinks()
+    assert missed.update({"bravo", "charlie"}, {"charlie"}, 0.0) == ()
+    assert missed.update({"bravo", "charlie"}, {"charlie"}, 4.9) == ()
+    assert missed.update({"bravo", "charlie"}, {"charlie"}, 5.0) == ("bravo",)
+    assert missed.update({"bravo", "charlie"}, {"charlie"}, 6.0) == (), "it has been told"
+    assert missed.update({"bravo"}, {"bravo"}, 7.0) == ()
+    assert missed.update({"bravo"}, set(), 8.0) == ()
+    assert missed.update(set(), set(), 12.0) == (), "it is not heard: it may be off"
+    assert missed.update({"bravo"}, set(), 13.0) == ()
+    assert missed.update({"bravo"}, set(), 18.0) == ("bravo",)
 
 
 def test_a_message_too_long_for_a_datagram_is_counted() -> None:
