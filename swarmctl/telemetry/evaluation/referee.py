@@ -90,6 +90,7 @@ class RunData:
     ticks: dict[int, NDArray[np.void]]  # by agent, rows of TICK_DTYPE
     truth: NDArray[np.void]  # rows of TRUTH_DTYPE, empty without a simulator
     events: list[dict[str, Any]]
+    cut: frozenset[int] = frozenset()  # agents of whose ticks only those of the newest of several clocks are there
 
 
 def evaluate(
@@ -109,7 +110,7 @@ def evaluate(
         problems: problems reported by the launcher in words; each is a violation.
         speed_factor: simulated seconds per wall second.
     """
-    clocked = by_station_clock(run.ticks, run.events)
+    clocked = by_station_clock(run.ticks, run.events, run.cut)
     run, known = replace(run, ticks=clocked.ticks, events=clocked.events(run.events)), clocked.known
     tracks = merge_tracks(known, run.truth, rules.agents)
     clock = _MissionClock(known, tracks)

@@ -8,7 +8,7 @@ as they do not step; that they drift apart, by up to a tenth of a second in an h
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,10 +101,44 @@ def seen_late(clocked: ClockedTicks, at_s: Callable[[float], float]) -> list[dic
     ]
 
 
-def by_station_clock(ticks: Mapping[int, NDArray[np.void]], events: Sequence[Mapping[str, Any]]) -> ClockedTicks:
-    """Return the ticks of a run with UTC by the station's clock; as they are where no station has recorded them."""
-    started = next((event for event in events if event.get("event") == "started"), {})
-    if started.get("agents") != []:
+def is_of_station(events: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether a station has recorded a run, by its events."""
+    return _started(events).get("agents") == []
+
+
+def by_newest_clock(rows: NDArray[np.void], most_us: int) -> tuple[NDArray[np.void], bool]:
+    """Return the ticks (T,) of an agent since its computer was started last, and whether that leaves out others.
+
+    Args:
+        rows: as a station has recorded them.
+        most_us: what the clocks of a run may span. Where UTC spans more, it has been set: it is taken to have been
+            before, too, what it was at the end.
+    """
+    if not len(rows):
+        return rows, False
+    t_us, is_cut = rows["t_us"].astype(np.float64), False
+    if np.ptp(t_us) > most_us:
+        steps_us = np.diff(t_us)
+        (ends,) = np.nonzero((steps_us < -_AGAIN_US) | (steps_us > most_us))
+        rows, is_cut = rows[ends[-1] + 1 :] if len(ends) else rows, len(ends) > 0
+    if np.ptp(rows["utc_us"].astype(np.float64)) > most_us:
+        rows = rows.copy()
+        rows["utc_us"] = rows["t_us"] + (rows["utc_us"][-1:] - rows["t_us"][-1:])
+    return rows, is_cut
+
+
+def by_station_clock(
+    ticks: Mapping[int, NDArray[np.void]], events: Sequence[Mapping[str, Any]], cut: Collection[int] = ()
+) -> ClockedTicks:
+    """Return the ticks of a run with UTC by the station's clock; as they are where no station has recorded them.
+
+    Args:
+        ticks: by agent.
+        events: of the run.
+        cut: agents whose clocks are not known, as only ticks of the newest of several are there.
+    """
+    started = _started(events)
+    if not is_of_station(events):
         return ClockedTicks(ticks=dict(ticks), ahead_s=None)
     own_utc_us, own_t_us = started.get("utc_us"), started.get("t_us")
     shifts_us = dict[int, int]()
@@ -115,7 +149,12 @@ def by_station_clock(ticks: Mapping[int, NDArray[np.void]], events: Sequence[Map
         shift_us = shifts_us.get(agent)
         if not len(rows):
             continue
-        if shift_us is None or abs(shift_us) > _LARGEST_US or (np.diff(rows["t_us"]) < -_AGAIN_US).any():
+        if (
+            agent in cut
+            or shift_us is None
+            or abs(shift_us) > _LARGEST_US
+            or (np.diff(rows["t_us"]) < -_AGAIN_US).any()
+        ):
             ahead_s[agent] = None
             continue
         clocked[agent] = rows.copy()
@@ -130,6 +169,10 @@ def corrected_text(clocks: Sequence[Mapping[str, Any]] | None) -> str:
     far = [(agent, ahead_s) for agent, ahead_s in found if abs(ahead_s) > _WORTH_TELLING_S]
     said = [f"agent {agent} {abs(by_s):.2f} s {'ahead' if by_s > 0.0 else 'behind'}" for agent, by_s in far[:_SHOWN]]
     return ", ".join([*said, *([f"{len(far) - _SHOWN} more"] if len(far) > _SHOWN else [])])
+
+
+def _started(events: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    return next((event for event in events if event.get("event") == "started"), {})
 
 
 def _least_us(events: Sequence[Mapping[str, Any]]) -> dict[int, int]:

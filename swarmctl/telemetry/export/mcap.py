@@ -77,7 +77,7 @@ def write_mcap(path: Path, recorded: RecordedFlight) -> None:
             "MCAP needs a library of its own. Install it, in the checkout: pip install '.[mcap]'"
         ) from error
     run = recorded.run
-    clocked = by_station_clock(run.ticks, run.events)
+    clocked = by_station_clock(run.ticks, run.events, run.cut)
     recorded = replace(recorded, run=replace(run, ticks=clocked.ticks, events=clocked.events(run.events)))
     context = foxglove.Context()
     with replaced(path) as file, foxglove.open_mcap(file, context=context) as writer:

@@ -27,6 +27,7 @@ from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
 from swarmctl.files import read_file, replaced
 from swarmctl.telemetry.evaluation.referee import RunData
+from swarmctl.telemetry.evaluation.station_clock import by_newest_clock, is_of_station
 from swarmctl.telemetry.evaluation.tracks import MAX_RUN_US
 from swarmctl.telemetry.recording.file_names import (
     AGENT_FILE,
@@ -58,12 +59,17 @@ def load_run(directory: Path) -> RunData:
     """
     refuse_no_folder(directory)
     ticks: dict[int, NDArray[np.void]] = {}
+    cut, events = set[int](), read_events(directory)
     for path in sorted(directory.iterdir(), key=lambda path: path.suffix):  # raw rows come last and replace Parquet
         match = AGENT_FILE.match(path.name)
         if match:
             rows = read_rows(path, TICK_DTYPE) if match[2] == "ticks" else read_parquet(path)
-            ticks[int(match[1])] = _in_time(path, rows, ("t_us", "utc_us"))
-    return RunData(ticks=dict(sorted(ticks.items())), truth=_read_truth(directory), events=read_events(directory))
+            agent, is_cut = int(match[1]), False
+            if is_of_station(events):  # other computers may be started again, or their clocks set
+                rows, is_cut = by_newest_clock(rows, MAX_RUN_US)
+            ticks[agent] = _in_time(path, rows, ("t_us", "utc_us"))
+            (cut.add if is_cut else cut.discard)(agent)
+    return RunData(dict(sorted(ticks.items())), _read_truth(directory), events, frozenset(cut))
 
 
 def _read_truth(directory: Path) -> NDArray[np.void]:

@@ -65,7 +65,7 @@ class RunCharts:
     """Draws the charts of one run."""
 
     def __init__(self, run: RunData, summary: Mapping[str, Any], rules: Rules | None) -> None:
-        clocked = by_station_clock(run.ticks, run.events)
+        clocked = by_station_clock(run.ticks, run.events, run.cut)
         self._run = run = replace(run, ticks=clocked.ticks, events=clocked.events(run.events))
         self.events = run.events  # those of agents by the station's clock
         self._summary = summary

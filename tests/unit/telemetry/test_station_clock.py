@@ -22,7 +22,7 @@ from swarmctl.ops.flight.summary import summary_lines
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
 from swarmctl.telemetry.evaluation.station_clock import corrected_text
-from swarmctl.telemetry.recording.run_files import load_run
+from swarmctl.telemetry.recording.run_files import load_run, write_parquet
 from swarmctl.telemetry.recording.summary_file import decode_summary
 from swarmctl.telemetry.report.run_charts import RunCharts
 from swarmctl.telemetry.report.run_report import summary_rows
@@ -195,3 +195,60 @@ def test_who_has_a_clock_that_is_not_known_is_not_judged() -> None:
         assert summary["clocks"] == [{"id": 0, "ahead_s": 0.0}, {"id": 1, "ahead_s": None}]
     judged = evaluate(run_of_station(near, (0, 0), (1, 9_000), (1, 0), (1, 7_000)), RULES, "completed")
     assert (judged["separation"]["min_m"], judged["clocks"][1]["ahead_s"]) == (pytest.approx(0.2), 0.0)
+
+
+DAY_US = 86_400_000_000
+
+
+def restarted(before_us: int, utc_before_us: int, after_us: int | None = None) -> NDArray[np.void]:
+    """Return ticks of an agent whose clocks were off by so much for the first 5 s, its monotonic one after, too."""
+    rows = ticks(20, (2.0, 0.0, 0.0))
+    rows["t_us"][:250] += before_us
+    rows["utc_us"][:250] += utc_before_us
+    rows["t_us"][250:] += after_us or 0
+    return rows
+
+
+def with_junk() -> NDArray[np.void]:
+    rows = ticks(20, (2.0, 0.0, 0.0))
+    rows["t_us"][250] = 2**62
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("rows", "is_known"),
+    [
+        (ticks(20, (2.0, 0.0, 0.0)), True),
+        (restarted(DAY_US, -60_000_000), False),
+        (restarted(3 * DAY_US, -60_000_000), False),
+        (restarted(0, -7 * DAY_US), True),
+        (restarted(0, -7 * DAY_US, 3 * DAY_US), False),
+        (with_junk(), False),
+    ],
+    ids=["as ever", "up for a day", "up for three days", "clock set by a week", "both", "junk"],
+)
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_computer_that_is_started_again_costs_the_verdict_on_its_agent_alone(
+    tmp_path: Path, rows: NDArray[np.void], is_known: bool, packed: bool
+) -> None:
+    """Nothing at all was judged where one clock spanned more than 48 hours."""
+    recorded = run_of_station(rows, (0, 0), (1, 0), (2, 0))
+    flown = {**recorded.ticks, 2: ticks(20, (0.0, 3.0, 0.0))}
+    for agent, each in flown.items():
+        write_rows(tmp_path, agent, each, packed=packed)
+    lines = [to_json({"source": "launch", **event}) for event in recorded.events]
+    (tmp_path / "launch.events.jsonl").write_text("\n".join(lines))
+    summary = evaluate(load_run(tmp_path), replace(RULES, agents=3), "completed")
+    ahead_s = {clock["id"]: clock["ahead_s"] for clock in summary["clocks"]}
+    assert (ahead_s[0], ahead_s[2]) == (0.0, 0.0)
+    assert (ahead_s[1] is not None) is is_known
+    assert summary["separation"]["min_m"] == pytest.approx(2.0 if is_known else 3.0)
+    assert any("agent 1: its clock is not known" in text for text in summary["violations"]) is not is_known
+    assert not any("agent 0" in text or "agent 2" in text for text in summary["violations"])
+
+
+def write_rows(folder: Path, agent: int, rows: NDArray[np.void], *, packed: bool) -> None:
+    if packed:
+        write_parquet(folder / f"agent-{agent}.parquet", rows)
+    else:
+        (folder / f"agent-{agent}.ticks").write_bytes(rows.tobytes())
