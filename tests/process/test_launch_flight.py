@@ -332,7 +332,7 @@ class OnTerminal(ScriptedServices):
 
 
 def test_a_terminal_that_takes_nothing_holds_up_no_flight(tmp_path: Path) -> None:
-    scene = OnTerminal(tmp_path, [FLIES_LONG, ends(0, 4.0)], BackgroundDisplay)
+    scene = OnTerminal(tmp_path, [FLIES_LONG, ends(0, 4.0)], lambda display: BackgroundDisplay(display, print))
     scene.act = lambda: scene.kill("agent-0")
     began_s = time.monotonic()
     assert scene.fly().outcome == "failed"

@@ -28,6 +28,7 @@ MAX_ANCESTORS = 64  # lists before this one by which it is known whether its ope
 MAX_REASON = 500  # longest reason of a refusal, or text about what is obeyed
 Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+Number = Annotated[int, msgspec.Meta(ge=-(2**31), lt=2**31)]  # of a vehicle; longer ones can't be formatted
 Agents = Annotated[tuple[Count, ...], msgspec.Meta(max_length=256)]
 Lags = Annotated[
     dict[Count, Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)]], msgspec.Meta(max_length=256)
@@ -39,20 +40,20 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
 
     agent: Count
     boot_id: Count
-    sysid: int
+    sysid: Number
     phase: Annotated[int, msgspec.Meta(ge=0, le=int(max(Phase)))]
     mode: Annotated[int, msgspec.Meta(ge=0, le=int(max(Mode)))]
     flight_mode: Annotated[int, msgspec.Meta(ge=0, le=int(max(FlightMode)))]
     armed: bool
-    landed: int
+    landed: Number
     held: bool  # an operator holds it, and `resume` lets it go on
     control: Word  # what it is doing: `control.phases.control_mode`
     altitude_m: float  # above the shared origin, where there is a state: `ground_speed_m_s` is -1 without one
     ground_speed_m_s: float
     battery_01: float  # -1, here and below: unknown
     pos_accuracy_m: float  # horizontal, 1 sigma, as its estimator reports it
-    gps_fix: int  # GPS_FIX_TYPE
-    satellites: int
+    gps_fix: Number  # GPS_FIX_TYPE
+    satellites: Number
     link_age_ms: float  # since the newest message of the vehicle
     keeps_up: bool = True  # with its deadlines, as it has shown in rehearsals on the ground
     ready_utc_us: Count  # time of reaching its start position, 0 before
@@ -63,9 +64,9 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     separation_m: float  # to the nearest peer now
     tick_p99_ms: float
     ticks: Count
-    deadline_misses: int
+    deadline_misses: Count
     plan_staleness_ms: float
-    solver_failed: int
+    solver_failed: Count
     active_alert: str  # newest one, "" for none
     alert_age_s: float  # since it began
     uses_commitments: bool  # it flies committed trajectories only, see `control.commit`
@@ -80,7 +81,7 @@ class CommandMessage(msgspec.Struct, frozen=True):
     """Holds an operator's order to one agent or to all (`agent` -1); verbs and arguments are `core.operator_verbs`."""
 
     verb: Word
-    agent: int
+    agent: Number
     utc_us: Count  # time of the request, by the clock of the agents asked
     arguments: Annotated[dict[Word, float], msgspec.Meta(max_length=8)] = {}
     number: Count = UNNUMBERED  # repetitions have the same, under newer stamps

@@ -196,7 +196,11 @@ class Launcher(Services):
         self._config = config
         self._options = options
         self._reserved = reserved
-        self.display: Display = BackgroundDisplay(open_display(run=part.run))
+        self.clock = WallClock()
+        self.log = EventLog(directory / events_file("launch"), "launch", self.clock.utc_us)
+        self.display: Display = BackgroundDisplay(
+            open_display(run=part.run), lambda why: self.log.write("display_failed", text=why)
+        )
         identity = None if part.links is None else part.links.identity
         self.context = RunContext(
             part.run,
@@ -207,8 +211,6 @@ class Launcher(Services):
             realtime=wants_realtime(config, part.agents),
         )
         self._links = part.links
-        self.clock = WallClock()
-        self.log = EventLog(directory / events_file("launch"), "launch", self.clock.utc_us)
         self.children: dict[str, Child] = {}
         self._shared: list[Child] = []  # processes of several agents
         self._announced: RunningLaunch | None = None

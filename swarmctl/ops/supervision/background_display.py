@@ -25,10 +25,11 @@ class BackgroundDisplay:
 
     Args:
         display: used in the thread alone, until it has ended.
+        failed: is told once, in words, why something could not be printed; the rest is printed all the same.
     """
 
-    def __init__(self, display: Display) -> None:
-        self._display = display
+    def __init__(self, display: Display, failed: Callable[[str], None]) -> None:
+        self._display, self._failed, self._has_failed = display, failed, False
         self._waiting: deque[Callable[[], None]] = deque(maxlen=_MOST_WAITING)
         self._shown: Callable[[], None] | None = None  # the newest state, while it waits
         self._is_closed, self._printed = False, 0
@@ -76,6 +77,15 @@ class BackgroundDisplay:
                 if not self._waiting:
                     break
                 prints = self._waiting.popleft()
-            prints()
+            self._attempt(prints)
             self._printed += 1
-        self._display.close()
+        self._attempt(self._display.close)
+
+    def _attempt(self, prints: Callable[[], None]) -> None:
+        """Print something; what can't be shown, as a terminal or others' numbers are, must not end the display."""
+        try:
+            prints()
+        except Exception as error:
+            if not self._has_failed:
+                self._has_failed = True
+                self._failed(f"{type(error).__name__}: {error}")

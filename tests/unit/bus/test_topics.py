@@ -368,16 +368,18 @@ def test_lists_and_numbers_from_outside_are_bounded() -> None:
         assert decode_obstacles(obstacles(**fields)) is None
     for fields in ({"radius_m": 1.76}, {"keep_out_m": 0.9}, {"keep_out_m": 3.0}, {"visibility_m": 1.75}):
         assert decode_obstacles(obstacles(**fields)) is None
-    for name in ("agent", "boot_id", "ticks", "ready_utc_us", "utc_us"):
-        for value in (-1, 10**30):
-            assert (
-                decode_status(
-                    msgspec.json.encode(msgspec.to_builtins(STATUS)).replace(
-                        f'"{name}":{getattr(STATUS, name)}'.encode(), f'"{name}":{value}'.encode()
-                    )
-                )
-                is None
-            )
+    for name in ("agent", "boot_id", "ticks", "ready_utc_us", "utc_us", "deadline_misses", "solver_failed"):
+        assert decode_status(status(name, -1)) is decode_status(status(name, 10**30)) is None
+    for name in ("sysid", "landed", "gps_fix", "satellites"):
+        assert decode_status(status(name, -1)) is not None, "unknown"
+        assert all(decode_status(status(name, value)) is None for value in (2**31, -(2**31) - 1, 10**400))
+    assert decode_command(encode_message(CommandMessage("hold", -1, UTC_US)).replace(b"-1", b"1" + 400 * b"0")) is None
+
+
+def status(name: str, value: int) -> bytes:
+    return msgspec.json.encode(msgspec.to_builtins(STATUS)).replace(
+        f'"{name}":{getattr(STATUS, name)}'.encode(), f'"{name}":{value}'.encode()
+    )
 
 
 def test_the_longest_good_message_of_every_topic_fits() -> None:

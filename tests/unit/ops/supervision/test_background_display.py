@@ -42,7 +42,7 @@ class Slow(Shown):
 
 def test_lines_keep_their_order_and_of_states_the_newest_is_shown() -> None:
     shown, view = Shown(), AgentView(agent=0)
-    display = BackgroundDisplay(shown)
+    display = BackgroundDisplay(shown, pytest.fail)
     display.print_line("first")
     for note in ("a", "b", "c"):
         view.note = note
@@ -60,15 +60,38 @@ def test_lines_keep_their_order_and_of_states_the_newest_is_shown() -> None:
 def test_the_end_waits_for_a_slow_terminal_and_not_for_one_that_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(background_display, "_STUCK_S", 0.3)
     stuck = Shown()
-    display = BackgroundDisplay(stuck)
+    display = BackgroundDisplay(stuck, pytest.fail)
     began_s = time.monotonic()
     display.print_line("never")
     display.close()
     assert time.monotonic() - began_s < 5.0
     slow = Slow()
-    display = BackgroundDisplay(slow)
+    display = BackgroundDisplay(slow, pytest.fail)
     for k in range(10):
         display.print_line(f"{k}")
     display.close()
     assert slow.said == [*map(str, range(10)), "closed"]
     stuck.goes_on.set()
+
+
+class Failing(Shown):
+    """One that can't show states, nor the last of them."""
+
+    def show(self, agents: Sequence[AgentView]) -> None:
+        raise OverflowError("int too large to convert to float")
+
+    def close(self) -> None:
+        raise OverflowError("once more")
+
+
+def test_what_can_not_be_shown_is_told_once_and_the_rest_is_shown() -> None:
+    """One status of a host took the table and all further lines from a station, until it was ended."""
+    failing, told = Failing(), list[str]()
+    failing.goes_on.set()
+    display = BackgroundDisplay(failing, told.append)
+    for line in ("first", "second"):
+        display.show([AgentView(agent=0)])
+        display.print_line(line)
+    display.close()
+    assert failing.said == ["first", "second"]
+    assert told == ["OverflowError: int too large to convert to float"]
