@@ -92,6 +92,7 @@ class Scene:
         plan_ned_m: Array | None = None,
         *,
         ahead_us: int = 0,
+        is_anew: bool = False,
     ) -> None:
         """Draw poses, trails and changes of state of an agent; its curves are drawn by `plots`.
 
@@ -101,6 +102,7 @@ class Scene:
             rows: `TICK_DTYPE` rows (T,).
             plan_ned_m: newest predicted path (M, 3), drawn at the last row; None to keep the old one.
             ahead_us: how far these times are ahead of those of other agents, which counts for distances between them.
+            is_anew: whether they do not follow those before.
         """
         if not len(rows):
             return
@@ -109,7 +111,7 @@ class Scene:
             self.plans(agent, t_us[-1:], [plan_ned_m])
         self._pending.setdefault(agent, []).append((t_us, rows))
         self._states[agent].take(t_us, rows)
-        self._separation.offer(agent, t_us - ahead_us, rows["pos_ned_m"])
+        self._separation.offer(agent, t_us - ahead_us, rows["pos_ned_m"], is_anew=is_anew)
         self._newest[agent] = rows[-1]
         self._newest_us = max(self._newest_us, int(t_us[-1]))
 

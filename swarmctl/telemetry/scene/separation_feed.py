@@ -13,6 +13,7 @@ from swarmctl.core.types import Array
 from swarmctl.telemetry.evaluation.tracks import GAP_US, GRID_US, interpolate
 
 _SILENT_US = 1_000_000
+_MOST_US = 10_000_000  # that is computed at once; what is older is left out
 
 
 class SeparationFeed:
@@ -23,8 +24,13 @@ class SeparationFeed:
         self._pos_ned_m: list[Array] = [np.zeros((0, 3)) for _ in range(agents)]
         self._next_us: int | None = None
 
-    def offer(self, agent: int, t_us: NDArray[np.int64], pos_ned_m: Array) -> None:
-        """Add positions (T, 3), NED, of an agent at `t_us` (T,), increasing; older ones than before are dropped."""
+    def offer(self, agent: int, t_us: NDArray[np.int64], pos_ned_m: Array, *, is_anew: bool = False) -> None:
+        """Add positions (T, 3), NED, of an agent at `t_us` (T,), increasing; older ones than before are dropped.
+
+        With `is_anew` they are by another clock than those before, which are forgotten.
+        """
+        if is_anew:
+            self._t_us[agent], self._pos_ned_m[agent] = np.zeros(0, np.int64), np.zeros((0, 3))
         if len(self._t_us[agent]):  # a clock is better known than before
             newer = t_us > self._t_us[agent][-1]
             t_us, pos_ned_m = t_us[newer], pos_ned_m[newer]
@@ -38,8 +44,8 @@ class SeparationFeed:
             return np.zeros(0, np.int64), np.zeros(0)
         live = [agent for agent, end_us in ends_us.items() if end_us >= max(ends_us.values()) - _SILENT_US]
         until_us = min(ends_us[agent] for agent in live)
-        if self._next_us is None:
-            self._next_us = max(int(self._t_us[agent][0]) for agent in live)
+        if self._next_us is None or abs(until_us - self._next_us) > _MOST_US:
+            self._next_us = max(until_us - _MOST_US, *(int(self._t_us[agent][0]) for agent in live))
         grid_us = np.arange(self._next_us, until_us + 1, GRID_US)
         if len(live) < 2 or not len(grid_us):
             return np.zeros(0, np.int64), np.zeros(0)

@@ -141,7 +141,8 @@ class Pump:
 
     def step(self) -> None:
         for batch in self._feed.take():
-            self._scene.ticks(batch.agent, batch.t_us, batch.rows, batch.plan_ned_m, ahead_us=batch.ahead_us)
+            clock = {"ahead_us": batch.ahead_us, "is_anew": batch.is_anew}
+            self._scene.ticks(batch.agent, batch.t_us, batch.rows, batch.plan_ned_m, **clock)
             self._newest_us = max(self._newest_us, int(batch.t_us[-1]))
         newer = self._feed.take_obstacles()
         if newer is not None:

@@ -185,31 +185,125 @@ def clock_rows(seqs: list[int], t_us: list[int], offset_us: int) -> NDArray[np.v
 
 def test_clock_of_an_agent_ignores_utc_steps_counts_gaps_and_survives_a_restart() -> None:
     clock = AgentClock()
-    t_us, newer = clock.place(clock_rows([0, 1, 4], [100, 200, 500], 1000), 1000)
+    t_us, newer = clock.place(clock_rows([0, 1, 4], [100, 200, 500], 1000), 1000, 2000)
     assert t_us.tolist() == [100, 200, 500]
     assert newer.all()
     assert clock.lost == 2
-    t_us, newer = clock.place(clock_rows([5, 6], [600, 600], 999_999), 1000)  # UTC stepped; one sample came twice
+    t_us, newer = clock.place(clock_rows([5, 6], [600, 600], 999_999), 1000, 2000)  # UTC stepped; one sample came twice
     assert t_us.tolist() == [600, 600]
     assert newer.tolist() == [True, False]
-    t_us, newer = clock.place(clock_rows([0, 1], [10, 30], 2000), 1000)  # another process, later in UTC
+    t_us, newer = clock.place(clock_rows([0, 1], [10, 30], 2000), 1000, 3000)  # another process, later in UTC
     assert t_us.tolist() == [1010, 1030]
     assert newer.all()
     assert clock.lost == 2
 
 
+class Sent:
+    """A bus on which ticks arrive once."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, bytes]] = []
+
+    def receive(self, topic: object) -> list[tuple[str, bytes]]:
+        arrived, self.sent = self.sent, []
+        return arrived
+
+
+class Live:
+    """A view of two agents, each 20 ms a tick of both; agent 1 is 2 m from agent 0."""
+
+    def __init__(self) -> None:
+        self.bus, self.now_us, self.seqs = Sent(), 1_780_000_000_000_000, [0, 0]
+        self.feed, self.separation = Feed(cast(Any, self.bus), 2, lambda: self.now_us), SeparationFeed(2)
+        self.drawn, self.least_m = [0, 0], list[float]()
+
+    def say(self, agent: int, *, t_us: int | None = None, utc_us: int | None = None, ahead_us: int = 0) -> None:
+        row = np.zeros(1, TICK_DTYPE)
+        row["seq"], row["pos_ned_m"] = self.seqs[agent], (2.0 * agent, 0.0, 0.0)
+        row["t_us"] = self.now_us - BOOTED_UTC_US if t_us is None else t_us
+        row["utc_us"] = self.now_us + ahead_us if utc_us is None else utc_us
+        self.seqs[agent] += 1
+        self.bus.sent.append((f"agent-{agent}", pack_tick(row, None)))
+
+    def fly(self, ticks: int, ahead_us: int = 0) -> None:
+        for _ in range(ticks):
+            self.now_us += 20_000
+            self.say(0)
+            self.say(1, ahead_us=ahead_us)
+            self.take()
+
+    def take(self) -> None:
+        for batch in self.feed.take():
+            self.drawn[batch.agent] += len(batch.rows)
+            corrected_us = batch.t_us - batch.ahead_us
+            self.separation.offer(batch.agent, corrected_us, batch.rows["pos_ned_m"], is_anew=batch.is_anew)
+        self.least_m += self.separation.take()[1].tolist()
+
+
+BOOTED_UTC_US = 1_779_000_000_000_000
+HOUR_US = 3_600_000_000
+
+
+@pytest.mark.parametrize(
+    ("t_us", "utc_us"),
+    [
+        (0, -(2**63)),
+        (2**63 - 1, -(2**63)),
+        (2**62, 2**62),
+        (10**15, None),
+        (2 * HOUR_US, None),
+        (-HOUR_US, None),
+        (10**15, 10**15),
+    ],
+)
+@pytest.mark.parametrize("begins", [False, True])
+def test_a_tick_of_no_clock_is_counted_and_the_view_goes_on(t_us: int, utc_us: int | None, begins: bool) -> None:
+    """One such tick ended the viewer, or asked it for 373 GiB, or kept an agent out of the view for good."""
+    live = Live()
+    if not begins:
+        live.fly(100)
+    before, counted = live.drawn[1], live.feed.malformed
+    live.say(1, t_us=t_us, utc_us=utc_us)
+    live.take()
+    assert live.drawn[1] - before <= begins
+    assert live.feed.malformed - counted == 1 or begins
+    before = live.drawn[1]
+    live.fly(100)
+    assert live.drawn[1] - before >= 98, "two are not believed after a first one that was not true"
+    assert live.least_m[-50:] == [2.0] * 50
+
+
+@pytest.mark.parametrize("again", [True, False], ids=["its agent is started again", "its agent flies on"])
+@pytest.mark.parametrize("ahead_us", [300_000_000, -300_000_000])
+def test_an_agent_whose_clock_was_set_is_drawn_on(ahead_us: int, again: bool) -> None:
+    """One that had been 5 minutes ahead was not drawn for as long, or for good."""
+    live = Live()
+    live.fly(100, ahead_us)
+    live.seqs[1] = 0 if again else live.seqs[1]
+    drawn, compared = live.drawn[1], len(live.least_m)
+    live.fly(100)
+    assert live.drawn[1] == drawn + 100
+    assert len(live.least_m) >= compared + 95
+    assert set(live.least_m) == {2.0}
+
+
+def test_who_falls_silent_and_comes_back_after_long_is_compared_from_then_on() -> None:
+    """All instants between were computed at once: 373 GiB of them."""
+    feed = SeparationFeed(2)
+    for begins_us in (0, 10**15):
+        t_us = begins_us + 20_000 * np.arange(50)
+        for agent in range(2):
+            feed.offer(agent, t_us, np.full((50, 3), float(agent)))
+        grid_us, least_m = feed.take()
+        assert begins_us <= grid_us[0] and grid_us[-1] == t_us[-1]
+        assert 49 <= len(least_m) <= 50
+
+
 @pytest.mark.parametrize("ahead_us", [0, 500_000, -3_600_000_000])
 def test_live_distances_are_of_the_same_instants_whatever_clocks_say(ahead_us: int) -> None:
     """Two vehicles fly the same line 1 m apart, at 2 m/s: by stamps 0.5 s apart they would meet."""
-    hub_us, sent = 1_000_000_000, list[tuple[str, bytes]]()
-
-    class Bus:
-        def receive(self, topic: object) -> list[tuple[str, bytes]]:
-            arrived = list(sent)
-            sent.clear()
-            return arrived
-
-    feed, separation, least_m = Feed(cast(Any, Bus()), 2, lambda: now_us), SeparationFeed(2), list[float]()
+    hub_us, bus = 1_000_000_000, Sent()
+    feed, separation, least_m = Feed(cast(Any, bus), 2, lambda: now_us), SeparationFeed(2), list[float]()
     now_us = hub_us
     for tick in range(500):
         now_us = hub_us + 20_000 * tick
@@ -218,7 +312,7 @@ def test_live_distances_are_of_the_same_instants_whatever_clocks_say(ahead_us: i
             row["seq"], row["t_us"] = tick, 20_000 * tick
             row["utc_us"] = now_us + agent * ahead_us
             row["pos_ned_m"] = (2.0 * 0.02 * tick - agent, 0.0, 0.0)
-            sent.append((f"agent-{agent}", pack_tick(row, None)))
+            bus.sent.append((f"agent-{agent}", pack_tick(row, None)))
         if tick % 5 == 0:
             now_us += 3_000
             for batch in feed.take():
