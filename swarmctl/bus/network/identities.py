@@ -109,6 +109,7 @@ def _reported(verb: str, folder: Path) -> Iterator[None]:
 
 def _make(folder: Path, name: str, signer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey], ip: _Ip | None) -> None:
     key = ec.generate_private_key(ec.SECP256R1())
+    (folder / key_file(name)).unlink(missing_ok=True)  # one without a certificate, as of a run that was cut off
     _write(folder, name, _signed(name, key.public_key(), signer, ip), key)
 
 
@@ -179,9 +180,13 @@ def _is_for(folder: Path, name: str, address: _Ip | None) -> bool:
 
 
 def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
-    """Write the key before the certificate, whose presence says that both are there."""
+    """Write the key before the certificate, whose presence says that both are there; or neither."""
     secret = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     create_private(folder / key_file(name), secret)
-    create_private(folder / certificate_file(name), certificate.public_bytes(serialization.Encoding.PEM))
+    try:
+        create_private(folder / certificate_file(name), certificate.public_bytes(serialization.Encoding.PEM))
+    except BaseException:
+        (folder / key_file(name)).unlink(missing_ok=True)
+        raise

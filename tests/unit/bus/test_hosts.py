@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import stat
 import sys
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 from cryptography.x509 import load_pem_x509_crl
 
+from swarmctl.bus.network import identities
 from swarmctl.bus.network.hosts import HostParams, host_problems, links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.keyring import load_keyring
@@ -122,6 +124,30 @@ def test_identities_are_made_once_and_for_hosts_that_are_added(path: Path) -> No
     (folder / "authority.key").unlink()
     with pytest.raises(ConfigError, match=r"authority\.key is not here"):
         make_host_identities(path)
+
+
+@pytest.mark.parametrize("file", ["authority.pem", "alpha.pem"])
+@pytest.mark.parametrize("cut_off", [False, True])
+def test_identities_are_made_after_a_disk_was_full_between_key_and_certificate(
+    path: Path, monkeypatch: pytest.MonkeyPatch, file: str, cut_off: bool
+) -> None:
+    """What is left by a process that was killed there is a key that nobody has a certificate for."""
+
+    def full(made: Path, content: bytes) -> None:
+        if made.name == file:
+            raise OSError(errno.ENOSPC, "No space left on device", str(made))
+        create_private(made, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(identities, "create_private", full)
+        with pytest.raises(ConfigError, match="No space left"):
+            make_host_identities(path)
+    folder = own_identity(load(path), STATION).folder
+    assert not list(Path(folder).glob("*.key")) if file == "authority.pem" else not Path(folder, "alpha.key").exists()
+    if cut_off and file != "authority.pem":
+        Path(folder, "alpha.key").write_bytes(b"of nobody")
+    make_host_identities(path)
+    load_keyring(own_identity(load(path), "alpha"))
 
 
 def test_a_host_flies_only_with_an_identity(path: Path) -> None:
