@@ -259,6 +259,14 @@ def vehicle_problems(
         seen_sysids.setdefault(vehicle.sysid, i)
 
 
+def one_place_at_two_hosts(vehicles: Sequence[VehicleParams], hosts: Sequence[HostParams]) -> tuple[int, int] | None:
+    """Return two vehicles that are at one place by their links, each of another computer; None where there are none."""
+    host_of = {agent: host.name for host in hosts for agent in host.agents}
+    links = [(i, parse_url(vehicle.url)) for i, vehicle in enumerate(vehicles) if i in host_of]
+    pairs = itertools.combinations(links, 2)
+    return next(((i, k) for (i, a), (k, b) in pairs if host_of[i] != host_of[k] and _same_place(a, b)), None)
+
+
 def forward_problems(urls: Sequence[str]) -> Iterator[str]:
     """Yield which ground stations can't be forwarded to."""
     for i, url in enumerate(urls):

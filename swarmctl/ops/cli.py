@@ -156,6 +156,9 @@ def simulate(
 def check(
     config: ConfigPath = None,
     agents: Agents = None,
+    host: Annotated[
+        str | None, typer.Option("--host", metavar="NAME", help="Of [[hosts]]: check the vehicles of this one only.")
+    ] = None,
     sets: Set = None,
     apply: Annotated[
         bool, typer.Option("--apply", help="Set the wanted parameters of disarmed vehicles; default: change nothing.")
@@ -175,15 +178,17 @@ def check(
 ) -> int:
     """Pre-flight check of every vehicle. Exit code 0: ready; 3: a vehicle is not reached; 4: something is to fix."""
     from swarmctl.config import load
-    from swarmctl.ops.vehicles.vehicle_check import CheckOptions
+    from swarmctl.ops.vehicles.vehicle_check import CheckOptions, agents_of
     from swarmctl.ops.vehicles.vehicle_check import check as check_vehicles
 
     if write is not None and not identify:
         raise ConfigError("--write", ["there is nothing to write without --identify"])
-    asked, options = (
-        load(config, _overrides(agents, None, None, sets)),
-        CheckOptions(apply=apply, seconds=seconds, json=json),
-    )
+    if host is not None and identify:
+        raise ConfigError("--host", ["--identify flies all vehicles by a launch; give a configuration of this host's"])
+    overrides = _overrides(agents, None, None, sets)
+    chosen = agents_of(load(config, overrides, only_agents=()), host)
+    asked = load(config, overrides, only_agents=chosen)  # signing keys of the others are on other computers
+    options = CheckOptions(apply=apply, seconds=seconds, json=json, agents=chosen)
     if not identify:
         return check_vehicles(asked, options)
     from swarmctl.ops.vehicles.identify import IdentifyOptions, check_and_identify

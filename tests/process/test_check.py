@@ -253,6 +253,53 @@ def test_a_missing_vehicle_and_one_with_anothers_id(simulators: Simulators, run_
     assert "it is vehicle 1, not 2" in printed
 
 
+def on_two_hosts(folder: Path, port: int, *, more: str = "") -> Path:
+    """Write a swarm of which alpha reaches a vehicle with id 2, and bravo at the same place one with id 1."""
+    path = folder / "two.toml"
+    text = '[sitl]\nenabled=false\n[swarm]\nagents=2\n[bus]\nidentities="ids"\n'
+    text += "[start]\npositions_ned_m=[[0,-3,-2],[0,0,-2]]\n"
+    for sysid in (2, 1):
+        text += f'[[vehicles]]\nsysid={sysid}\nurl="udpin://127.0.0.1:{port}"\n'
+    for number, name in enumerate(("alpha", "bravo")):
+        text += f'[[hosts]]\nname="{name}"\naddress="10.20.0.{number + 1}:7448"\nagents=[{number}]\n'
+    path.write_text(text + more)
+    return path
+
+
+def on_command_line(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "swarmctl", "check", *map(str, arguments), "--seconds=1"]
+    return subprocess.run(command, cwd=ROOT, env=ENV, capture_output=True, text=True, timeout=60)
+
+
+def test_a_host_checks_its_own_vehicles_and_needs_their_keys_alone(simulators: Simulators, tmp_path: Path) -> None:
+    """The link was opened as agent-0's, too, who was told to change the id of agent-1's vehicle."""
+    path, result = on_two_hosts(tmp_path, simulators[1].ports[0]), tmp_path / "check.json"
+    said = on_command_line(path, "--host", "bravo", "--json", result)
+    found = json.loads(result.read_text())
+    assert [(v["agent"], v["unreachable"]) for v in found["vehicles"]] == [(1, "")], said.stderr
+    assert verdict(found, "system id", 1) == "OK"
+    assert "agent-0" not in said.stdout
+
+    write_new_key(tmp_path / "1.key")
+    path = on_two_hosts(tmp_path, simulators[1].ports[0], more='[mavlink]\nsigning_keys=["0.key","1.key"]\n')
+    said = on_command_line(path, "--host", "bravo")
+    assert "0.key" not in said.stderr and "1 vehicles reached" in said.stdout, said.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), "vehicles.0 and vehicles.1 are at udpin://127.0.0.1:1 of two computers: name the one that this is"),
+        (("--host", "charlie"), "no such computer in [[hosts]]; there are: alpha, bravo"),
+        (("--host", "bravo", "--identify"), "--identify flies all vehicles"),
+    ],
+)
+def test_which_host_is_meant_has_to_be_said(tmp_path: Path, options: tuple[str, ...], words: str) -> None:
+    said = on_command_line(on_two_hosts(tmp_path, 1), *options)
+    assert (said.returncode, said.stdout) == (2, "")
+    assert words in said.stderr
+
+
 def test_an_armed_vehicle_is_reported_and_left_alone(simulators: Simulators, run_check: Check) -> None:
     port = simulators[1].ports[0]
     with Pilot(port) as pilot:

@@ -23,7 +23,8 @@ from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import as_json, print_check
 from swarmctl.config import Config
 from swarmctl.configuration.config_warnings import warning_lines
-from swarmctl.errors import StartError
+from swarmctl.configuration.constraints import one_place_at_two_hosts
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.vehicles.vehicle_links import VehicleLinks, open_links
 from swarmctl.process_lifetime import StopRequest
 
@@ -43,7 +44,31 @@ class CheckOptions:
     seconds: float = 3.0  # time to listen to every vehicle after its first heartbeat
     json: Path | None = None
     connect_s: float = _CONNECT_S
+    agents: tuple[int, ...] | None = None  # those whose vehicles are checked; None: all
     to_fly: bool = False  # a flight follows: armed vehicles are findings, because another party flies them
+
+
+def agents_of(config: Config, host: str | None) -> tuple[int, ...] | None:
+    """Return the agents whose vehicles are reached from one computer; None for all of them.
+
+    Args:
+        config: of the whole swarm.
+        host: name of this computer in `[[hosts]]`; None: it is not said.
+
+    Raises:
+        ConfigError: there is no such host, or it has to be said, as another vehicle would be taken for the one meant.
+    """
+    if host is not None:
+        agents = next((known.agents for known in config.hosts if known.name == host), None)
+        if agents is None:
+            names = ", ".join(known.name for known in config.hosts) or "none"
+            raise ConfigError("--host", [f"{host!r}: no such computer in [[hosts]]; there are: {names}"])
+        return tuple(sorted(agents))
+    if not config.sitl.enabled and (pair := one_place_at_two_hosts(config.vehicles, config.hosts)) is not None:
+        names = ", ".join(known.name for known in config.hosts)
+        place = f"vehicles.{pair[0]} and vehicles.{pair[1]} are at {config.vehicles[pair[1]].url} of two computers"
+        raise ConfigError("--host", [f"{place}: name the one that this is, of {names}"])
+    return None
 
 
 def check(config: Config, options: CheckOptions) -> int:
@@ -59,7 +84,7 @@ def check(config: Config, options: CheckOptions) -> int:
     for line in warning_lines(config):
         print(line, file=sys.stderr)
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)  # so that started processes are ended
-    with ended_cleanly, open_links(config, options.connect_s) as opened:
+    with ended_cleanly, open_links(config, options.connect_s, options.agents) as opened:
         vehicles, changed = _scan(config, options, opened)
     lines = findings(vehicles, config) + [change.finding() for change in changed if not change.done]
     if options.to_fly:

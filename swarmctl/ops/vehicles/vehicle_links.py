@@ -1,4 +1,4 @@
-"""Opens the links of all vehicles of a configuration for a check, which receives from every sender.
+"""Opens the links of vehicles of a configuration for a check, which receives from every sender.
 
 A configured built-in simulator is started for the time they are open, and ended with them.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from swarmctl.mavlink.signing.recognition import SignedRecognition
 from swarmctl.mavlink.signing.stamp_file import kept_channel
 from swarmctl.ops.preflight import claim_ports
 from swarmctl.ops.processes import Child, RunContext, end_all, run_name, sitl_command, wants_realtime
-from swarmctl.signing_keys import read_keys
+from swarmctl.signing_keys import read_keys, read_own_key
 from swarmctl.wall_clock import WallClock, monotonic_us
 
 _SIMULATOR_S = 20.0  # to start on a busy machine
@@ -49,9 +49,9 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class VehicleLinks:
-    """The links of all vehicles."""
+    """The links of vehicles."""
 
-    links: Sequence[Link]
+    links: Mapping[int, Link]  # by agent
     connect_s: float
     simulator: Child | None = None
 
@@ -71,7 +71,7 @@ class VehicleLinks:
             agent: VehicleScan(
                 link.listener, link.there, sysids[agent], names, seconds=seconds, patience_s=self.patience_s
             )
-            for agent, link in enumerate(self.links)
+            for agent, link in self.links.items()
             if link.listener is not None
         }
 
@@ -83,31 +83,44 @@ class VehicleLinks:
             facts_of(scans[agent], agent, link.url, sysids[agent], shared=shared, now_us=now_us)
             if agent in scans
             else unreached(agent, link.url, sysids[agent], link.problem)
-            for agent, link in enumerate(self.links)
+            for agent, link in self.links.items()
         ]
 
 
 @contextlib.contextmanager
-def open_links(config: Config, connect_s: float) -> Iterator[VehicleLinks]:
-    """Open the links, with `connect_s` as the time to wait for a heartbeat, and close them afterwards."""
-    keys = read_keys(config.mavlink.signing_keys, config.swarm.agents)
+def open_links(config: Config, connect_s: float, agents: Sequence[int] | None = None) -> Iterator[VehicleLinks]:
+    """Open links, and close them afterwards.
+
+    Args:
+        config: of all vehicles.
+        connect_s: time to wait for a heartbeat.
+        agents: those whose vehicles are asked; None: all.
+    """
+    names, sysids = config.mavlink.signing_keys, config.sysids()
+    if agents is None:
+        agents = range(config.swarm.agents)
+        keys = dict(enumerate(read_keys(names, config.swarm.agents)))
+    else:  # those of the others may be on other computers
+        keys = {agent: read_own_key(names, agent) for agent in agents}
     with contextlib.ExitStack() as kept:
         clock = WallClock()
-        channels = [
-            None if key is None else kept.enter_context(kept_channel(key, CHECK_LINK, clock.utc_us)) for key in keys
-        ]
-        opened = kept.enter_context(_simulator(config) if config.sitl.enabled else _vehicles(config, connect_s))
-        links = zip(opened.links, channels, config.sysids(), strict=True)
-        yield replace(opened, links=[_signed(link, channel, sysid, clock) for link, channel, sysid in links])
+        channels = {
+            agent: None if key is None else kept.enter_context(kept_channel(key, CHECK_LINK, clock.utc_us))
+            for agent, key in keys.items()
+        }
+        of_all = _simulator(config, agents) if config.sitl.enabled else _vehicles(config, agents, connect_s)
+        opened = kept.enter_context(of_all)
+        links = {a: _signed(link, channels[a], sysids[a], clock) for a, link in opened.links.items()}
+        yield replace(opened, links=links)
 
 
 @contextlib.contextmanager
-def _vehicles(config: Config, connect_s: float) -> Iterator[VehicleLinks]:
-    links = [_open(vehicle.url) for vehicle in config.vehicles[: config.swarm.agents]]
+def _vehicles(config: Config, agents: Sequence[int], connect_s: float) -> Iterator[VehicleLinks]:
+    links = {agent: _open(config.vehicles[agent].url) for agent in agents}
     try:
         yield VehicleLinks(links, connect_s)
     finally:
-        _close(links)
+        _close(links.values())
 
 
 def _signed(link: Link, channel: SigningChannel | None, sysid: int, clock: WallClock) -> Link:
@@ -126,29 +139,28 @@ def _open(url: str) -> Link:
     return Link(url=url, listener=listener, there=there)
 
 
-def _close(links: Sequence[Link]) -> None:
+def _close(links: Iterable[Link]) -> None:
     for link in links:
         if link.listener is not None:
             link.listener.close()
 
 
 @contextlib.contextmanager
-def _simulator(config: Config) -> Iterator[VehicleLinks]:
+def _simulator(config: Config, agents: Sequence[int]) -> Iterator[VehicleLinks]:
     """Start the simulator of a launch on separate ports, and yield its links."""
-    sockets = claim_ports(config.swarm.agents)
+    sockets = claim_ports(len(agents))
     ports = [sock.getsockname()[1] for sock in sockets]
-    links = [
-        Link(url=f"built-in simulator, port {p}", listener=UdpListener(s), there=NOWHERE)
-        for s, p in zip(sockets, ports, strict=True)
-    ]
+    links = {
+        agent: Link(url=f"built-in simulator, port {p}", listener=UdpListener(s), there=NOWHERE)
+        for agent, s, p in zip(agents, sockets, ports, strict=True)
+    }
     directory = Path(tempfile.mkdtemp(prefix="swarm-check-"))
     children: list[Child] = []
-    agents = tuple(range(config.swarm.agents))
     context = RunContext(
         run_name(config.name),
         f"{SCHEME}{directory / 'bus.sock'}",
         directory,
-        agents,
+        tuple(agents),
         realtime=wants_realtime(config, agents),
     )
     try:
@@ -156,5 +168,5 @@ def _simulator(config: Config) -> Iterator[VehicleLinks]:
         yield VehicleLinks(links, _SIMULATOR_S, children[0])
     finally:
         end_all(children, _STOP_S)
-        _close(links)
+        _close(links.values())
         shutil.rmtree(directory, ignore_errors=True)
