@@ -74,9 +74,10 @@ class DatagramLinks:
     """
 
     def __init__(self, session: Any, identity: OwnIdentity, keys: PairKeys, sock: socket.socket) -> None:
-        addresses, number = _addresses(identity), secrets.randbits(64) or 1
+        addresses = _addresses(identity)
         self._session, self._socket = session, sock
-        self._routes = DatagramRoutes(identity.roster, identity.name, keys, addresses, session=number)
+        self._routes = DatagramRoutes(identity.roster, identity.name, keys, addresses, session=_session_number())
+        self._may_be_anywhere = identity.name not in addresses
         self._lock = threading.Lock()  # several threads send, one receives
         self._publishers: dict[str, MarkedPublisher] = {}
         self._ends = threading.Event()
@@ -140,6 +141,8 @@ class DatagramLinks:
             if now_s >= beat_s:
                 beat_s = now_s + BEAT_S
                 with self._lock:
+                    if self._may_be_anywhere and self._routes.is_cut_off(now_s):
+                        self._routes.begin_anew(_session_number(), now_s)
                     outgoing = self._routes.beat(now_s)
                 self._send_all(outgoing)
                 self._tell_refused(now_s)
@@ -190,6 +193,10 @@ class DatagramLinks:
             self._told, self._told_s = refused, now_s
             counts = ", ".join(f"{count} {reason}" for reason, count in self._routes.refused.most_common())
             print(f"datagrams refused so far: {counts}", file=sys.stderr, flush=True)
+
+
+def _session_number() -> int:
+    return secrets.randbits(64) or 1
 
 
 def bind_datagrams(identity: OwnIdentity) -> socket.socket:

@@ -3,6 +3,8 @@
 Every computer tells every other one, ten times a second, whom it hears. Who does not hear this one directly is also
 sent what it says by a third computer that is heard by this one and hears both, where the roster allows relays; the
 third one can't read it.
+
+The station may be anywhere, so there may be two by mistake. The first one keeps its place while it is heard.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from swarmctl.bus.topics import TICK, TOPICS
 BEAT_S = 0.1
 HEARD_S = 0.5  # a computer of which nothing has come for so long is not heard
 GONE_S = 5.0  # the station, silent for so long, is told nothing until it is heard again
+HELD_S = 2.0  # silent for so long, it gives way to another one
 TOO_LONG_TO_SEND = "too_long_to_send"  # by a client of this computer
 _BODY = struct.Struct("<BQ")  # kind, mask of who is heard directly: a bit for each of MOST_HOSTS and the station
 _BEAT, _MESSAGE, _FOR_ANOTHER = 0, 1, 2
@@ -80,6 +83,7 @@ class DatagramRoutes:
     def __init__(
         self, roster: Roster, me: str, keys: PairKeys, addresses: Mapping[str, Address], *, session: int
     ) -> None:
+        self._keys, self._began_s = keys, float("-inf")
         self._names = roster.names
         self._me = self._names.index(me)
         self._relay = roster.relay
@@ -97,6 +101,19 @@ class DatagramRoutes:
             if place != self._me and key is not None
         }
         self.refused: Counter[str] = Counter()
+
+    def is_cut_off(self, now_s: float) -> bool:
+        """Return whether those that were heard are heard no more, as once another one has taken this one's place."""
+        heard_s = max((link.heard_s for link in self._links.values()), default=float("-inf"))
+        return heard_s > float("-inf") and now_s - max(heard_s, self._began_s) >= GONE_S
+
+    def begin_anew(self, session: int, now_s: float) -> None:
+        """Go on as a new process would: who has ended this one's session takes nothing of it any more."""
+        self._began_s = now_s
+        for place, link in self._links.items():
+            key = self._keys[place]
+            assert key is not None  # or there would be no link
+            link.channel = DatagramChannel(key, me=self._me, other=place, session=session)
 
     def heard(self, now_s: float) -> frozenset[str]:
         """Return the names of the computers that are heard directly."""
@@ -140,7 +157,8 @@ class DatagramRoutes:
         link = None if route is None or route.receiver != self._me else self._links.get(route.sender)
         if route is None or link is None:
             return self._refuse(MALFORMED if route is None else FORGED)
-        opened = link.channel.open(datagram)
+        is_free = link.is_fixed or now_s - link.told_s >= HELD_S
+        opened = link.channel.open(datagram, may_begin=is_free)
         if opened.refused:
             return self._refuse(opened.refused)
         if opened.wants_answer:

@@ -27,6 +27,7 @@ from swarmctl.bus.refusals import FORGED, MALFORMED, REPLAYED
 
 DATAGRAM_VERSION = 1
 MOST_DATAGRAM_BYTES = 65_507  # of UDP over IPv4; what exceeds the link's packets is fragmented by IP
+OCCUPIED = "occupied"  # refused: by another computer of the same identity, which is there
 _MAGIC = b"SD"
 _HEADER = struct.Struct("<2sBBBBQQQ")  # magic, version, from, to, whether relayed, session, receiver's session, number
 _TAG_BYTES = 16
@@ -102,8 +103,11 @@ class DatagramChannel:
         )
         return header + self._sending.encrypt(_NONCE.pack(self._number), body, header)
 
-    def open(self, datagram: bytes) -> Opened:
-        """Open a datagram whose route is from the other computer to this one."""
+    def open(self, datagram: bytes, *, may_begin: bool = True) -> Opened:
+        """Open a datagram whose route is from the other computer to this one.
+
+        Another session of it is believed, and ends the one before, with `may_begin` alone.
+        """
         *_, relayed, session, named, number = _HEADER.unpack_from(datagram)
         if session in self._ended:
             return Opened(refused=REPLAYED)
@@ -118,6 +122,8 @@ class DatagramChannel:
             self._learnt = session
             return Opened(wants_answer=True, relayed=bool(relayed))
         if not is_known:
+            if self._known and not may_begin:
+                return Opened(refused=OCCUPIED)
             self._begin(session, cipher)
         if not self._is_new(number):
             return Opened(refused=REPLAYED)

@@ -44,6 +44,7 @@ from swarmctl.telemetry.recording.recorder import Recorder
 from swarmctl.wall_clock import WallClock
 
 _STEP_S = 0.05
+_DEAF_S = 5.0  # for which no status comes of any agent that is there; another session is opened before
 _GONE_S = 3.0  # an agent that was done and is silent for so long has ended
 _SILENT_S = 5.0  # an agent in flight that is silent for so long when the station is ended counts as lost; 25 statuses
 
@@ -144,6 +145,7 @@ class SwarmWatch:
         self._died: dict[int, str] = {}  # agents whose process ended before the vehicle was down, in words
         self._own_pause = OwnPause(clock_s())
         self._code, self._has_told_code = code_in_words(own_folder=""), False
+        self._has_told_deaf = False
         self.problems: list[str] = []
         self.was_stopped = self.is_over = False
 
@@ -160,6 +162,7 @@ class SwarmWatch:
             if not ended.is_down:
                 self._take_early_end(ended)
         self._keep_obstacles()
+        self._tell_deaf(now_s)
         self._report.step()
         self._display.show(self._views)
         lost = self._lost(now_s, RECOVERY_S)  # a host that lives would have landed its vehicle meanwhile
@@ -213,6 +216,19 @@ class SwarmWatch:
         theirs = status.code or "an older swarmctl"
         text = f"{agent_name(status.agent)} flies {theirs}, and {self._code} judges here: verdicts may differ"
         self._say("other_code", text, agent=status.agent, theirs=status.code, own=self._code)
+
+    def _tell_deaf(self, now_s: float) -> None:
+        """Say it once when agents are there of which nothing that may be lost arrives: nothing else would tell."""
+        is_deaf = now_s - max((view.received_s for view in self._views), default=now_s) >= _DEAF_S
+        there = sorted(self._numbers[name] for name in self._bus.alive() & self._numbers.keys()) if is_deaf else []
+        if there and not self._has_told_deaf:
+            names = ", ".join(map(agent_name, there))
+            text = (
+                f"{names}: on the bus, and no status has come for {_DEAF_S:g} s. Another station is running, or UDP at "
+                "the port after that of the hosts' addresses does not pass"
+            )
+            self._say("station_deaf", text, agents=there)
+        self._has_told_deaf = bool(there)
 
     def _keep_obstacles(self) -> None:
         """Repeat the list of obstacles, record what hosts keep clear of, and say what operators have to know."""

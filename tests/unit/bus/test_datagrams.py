@@ -6,13 +6,13 @@ import random
 import struct
 from collections import Counter
 from collections.abc import Callable
-from itertools import combinations
+from itertools import combinations, count
 
 import pytest
 
 from swarmctl.bus.network.datagram_links import MissedLinks
-from swarmctl.bus.network.datagram_routes import BEAT_S, GONE_S, HEARD_S, TOO_LONG_TO_SEND, DatagramRoutes
-from swarmctl.bus.network.datagrams import MOST_DATAGRAM_BYTES, DatagramChannel, Opened, route_of
+from swarmctl.bus.network.datagram_routes import BEAT_S, GONE_S, HEARD_S, HELD_S, TOO_LONG_TO_SEND, DatagramRoutes
+from swarmctl.bus.network.datagrams import MOST_DATAGRAM_BYTES, OCCUPIED, DatagramChannel, Opened, route_of
 from swarmctl.bus.network.hosts import HostParams, roster_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.refusals import FORGED, MALFORMED, REPLAYED
@@ -120,6 +120,7 @@ class Net:
         self._pairs = {frozenset(pair): bytes((i,)) * 32 for i, pair in enumerate(combinations(self.roster.names, 2))}
         self.loses: Callable[[str, str], bool] = lambda _a, _b: False
         self.station = STATION_ADDRESS
+        self.second = "second", ("10.0.0.11", 50_002)  # another station by mistake, once it is in `at`
         self.got: dict[str, list[tuple[str, bytes]]] = {}
         self.sent: list[tuple[str, str, bytes]] = []
         self.at = {name: self.new(name, number) for number, name in enumerate(self.roster.names, 1)}
@@ -131,7 +132,8 @@ class Net:
     def carry(self, name: str, outgoing: list[tuple[bytes, tuple[str, int]]]) -> None:
         """Carry datagrams, and those that answer them."""
         where = {self.station: STATION} | {address: host for host, address in ADDRESSES.items()}
-        source = ADDRESSES.get(name, self.station)
+        where |= {address: second for second, address in [self.second] if second in self.at}
+        source = (ADDRESSES | dict([self.second])).get(name, self.station)
         for datagram, address in outgoing:
             to = where.get(address, "nobody")
             if to == "nobody":
@@ -276,10 +278,49 @@ def test_the_station_is_told_where_it_was_heard_and_nothing_once_it_is_gone() ->
 def test_a_station_that_is_started_again_elsewhere_is_told_there() -> None:
     net = Net()
     net.beat()
+    net.now_s += HELD_S  # in which the one before would still be there
     net.at[STATION] = net.new(STATION, 88)
     net.station = ("10.0.0.10", 50_001)
     net.beat()
     assert net.say("alpha", TICK.format(0)) == {STATION: 1}
+
+
+@pytest.mark.parametrize("relay", [True, False])
+def test_a_second_station_takes_nothing_from_the_first_and_who_was_cut_off_comes_back(relay: bool) -> None:
+    """The first one was silenced for good, without a word, also once the second had ended."""
+    net, sessions = Net(relay=relay), count(100)
+
+    def heard_after(seconds: float) -> dict[str, int]:
+        for _ in range(round(seconds / BEAT_S)):
+            for name in {STATION, "second"} & net.at.keys():
+                if net.at[name].is_cut_off(net.now_s):
+                    net.at[name].begin_anew(next(sessions), net.now_s)
+            net.beat(1)
+        return net.say("alpha", TICK.format(0))
+
+    assert heard_after(1.0) == {STATION: 1}
+    net.at["second"] = net.new(STATION, 88)
+    assert heard_after(2.0 * GONE_S) == {STATION: 1}
+    assert net.at["alpha"].refused[OCCUPIED] > 0
+    net.loses = lambda a, b: STATION in (a, b)
+    assert heard_after(2.0 * HELD_S) == {"second": 1}, "the first one's network is cut"
+    net.loses = lambda _a, _b: False
+    assert heard_after(2.0 * GONE_S) == {"second": 1}
+    del net.at["second"]
+    assert heard_after(GONE_S) == {STATION: 1}
+
+
+def test_negative_control_a_station_that_does_not_begin_anew_stays_cut_off() -> None:
+    net = Net()
+    net.beat()
+    net.loses = lambda a, b: STATION in (a, b)
+    net.now_s += HELD_S
+    net.at["second"] = net.new(STATION, 88)
+    net.beat()
+    net.loses = lambda _a, _b: False
+    del net.at["second"]
+    net.beat(200)
+    assert net.say("alpha", TICK.format(0)) == {}
 
 
 def test_half_of_all_datagrams_lost_leaves_half_of_the_messages() -> None:

@@ -170,6 +170,19 @@ ALL_TRACK = dict.fromkeys(range(3), Phase.TRACK)
 LOST = "agent-1 was lost in TRACK: nothing was heard of it for 90 s"
 
 
+def test_a_station_says_that_nothing_arrives_of_agents_that_are_there(watched: Watched) -> None:
+    """As beside another station, which was told everything in its place."""
+    deaf = ("station_deaf", [0, 1, 2])
+    assert not watched.run(4.8, {})
+    assert deaf not in watched.noted
+    watched.run(4.0, {})
+    assert watched.noted.count(deaf) == 1, "once"
+    assert "Another station is running" in watched.said.getvalue()
+    watched.run(10.0, {0: Phase.TRACK})
+    watched.run(6.0, {})
+    assert watched.noted.count(deaf) == 2, "again after something had arrived"
+
+
 def test_a_station_ends_without_an_agent_that_was_lost_in_flight_and_says_so(watched: Watched) -> None:
     assert not watched.run(5.0, ALL_TRACK)
     assert not watched.run(80.0, {0: Phase.TRACK, 2: Phase.TRACK})
