@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 
 from swarmctl.bus.bus import Bus, ForwardingBus, agent_name
 from swarmctl.bus.messages.commitment_messages import HeardTimes
@@ -20,6 +22,7 @@ from swarmctl.core.trajectory_message import TrajectoryMessage
 RELAY_VERSION = 1
 _RELAY_AFTER_PERIODS = 4  # without a message of the other one, after which a peer is helped: one or two get lost
 _HELPED_US = 3_000_000  # a peer that was itself not heard for this long is not
+_SUPERSEDED = 32  # messages of each sender before its newest, by which older ones of relays are known
 _NEVER = (0, 0)  # stamp and arrival of the newest message of an agent that was never heard
 _MAGIC = b"SR"
 _HEADER = struct.Struct("<2sBB")  # magic, version, count
@@ -69,6 +72,7 @@ class RelayingBus(ForwardingBus):
         super().__init__(bus)
         self._names = {peer: agent_name(peer) for peer in peers}
         self._newest: dict[str, bytes] = {}  # of each sender, as it was carried
+        self._superseded: defaultdict[str, deque[bytes]] = defaultdict(partial(deque, maxlen=_SUPERSEDED))
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
         """Return what has come since the last call, what was relayed first."""
@@ -79,7 +83,11 @@ class RelayingBus(ForwardingBus):
             found = arrived
         else:
             return arrived
-        self._newest.update((sender, payload) for sender, payload in found if payload != TOO_LONG)
+        for sender, payload in found:
+            if payload != TOO_LONG:
+                if (before := self._newest.get(sender, payload)) != payload:
+                    self._superseded[sender].append(before)
+                self._newest[sender] = payload
         return found
 
     def relay(self, agents: Iterable[int]) -> int:
@@ -92,7 +100,10 @@ class RelayingBus(ForwardingBus):
         return len(payload)
 
     def _relayed(self) -> list[tuple[str, bytes]]:
-        """Return relayed messages that differ from the newest of their agents; one not to be read is its relay's."""
+        """Return relayed messages that are no older ones of their agents; one not to be read is its relay's.
+
+        An older one would be passed on in place of the newest, which nobody may have any more. Sealed ones tell no age.
+        """
         found = list[tuple[str, bytes]]()
         for sender, payload in self._bus.receive(RELAY):
             messages = decode_relay(payload)
@@ -100,8 +111,11 @@ class RelayingBus(ForwardingBus):
                 found.append((sender, TOO_LONG))
                 continue
             names = [(self._names[agent], carried) for agent, carried in messages if agent in self._names]
-            found += [item for item in names if self._newest.get(item[0]) != item[1] and item not in found]
+            found += [item for item in names if not self._is_known(*item) and item not in found]
         return found
+
+    def _is_known(self, sender: str, payload: bytes) -> bool:
+        return self._newest.get(sender) == payload or payload in self._superseded[sender]
 
 
 def missed_by_peers(

@@ -94,6 +94,18 @@ def test_what_is_known_already_is_not_delivered_again() -> None:
     assert three.receive(2) == []
 
 
+def test_who_has_the_last_message_of_an_agent_passes_that_on_after_a_relay_of_one_before() -> None:
+    """It passed on the one before, too, and nobody who had missed the last one could hear it any more."""
+    three = Three()
+    for said in (b"before", b"last"):
+        three.buses[0].publish(TRAJECTORY, said)
+        three.receive(1)
+    three.buses[2].publish(RELAY, encode_relay([(0, b"before")]))
+    assert three.receive(1) == [], "it is known"
+    three.buses[1].relay([0])
+    assert three.receive(2) == [(agent_name(0), b"last")]
+
+
 def test_who_knows_nothing_relays_nothing() -> None:
     three = Three()
     assert three.buses[1].relay([0, 2]) == 0
