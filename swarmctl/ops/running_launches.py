@@ -201,12 +201,19 @@ def _temporary_registry() -> Path | None:
 
 
 def _temporary_folders() -> list[Path]:
-    """Return where launches may have left notes: to find the one that flies, no disk has to take a file."""
+    """Return where launches may have left notes: to find the one that flies, no disk has to take a file.
+
+    Python takes the first of some folders that takes a file. One before it may have been that when a launch started,
+    and be full by now.
+    """
+    named = (os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))
+    folders = list(dict.fromkeys(Path(folder) for folder in (*named, "/tmp", "/var/tmp") if folder))
     try:
-        return [Path(tempfile.gettempdir())]
+        now = Path(tempfile.gettempdir())
+        before = folders[: folders.index(now)] if now in folders else folders if now == Path.cwd() else []
     except OSError:
-        named = (os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))
-        return list(dict.fromkeys(Path(folder) for folder in (*named, "/tmp", "/var/tmp") if folder))
+        return folders
+    return [*before, now]
 
 
 def _temporary_name() -> str:

@@ -560,6 +560,26 @@ def test_a_launch_and_its_verbs_find_each_other_although_another_user_takes_the_
     assert len(list(temporary.glob("swarmctl-*"))) == 2, "one more, not one each time"
 
 
+def test_a_launch_is_found_whose_temporary_folder_is_full_by_now(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Where another disk had room, verbs looked there only."""
+    first, second, folder = tmp_path / "first", tmp_path / "second", tmp_path / "run"
+    for place in (first, second, folder):
+        place.mkdir(mode=0o700)
+    monkeypatch.setenv("TMPDIR", str(first))
+    monkeypatch.setenv("TEMP", str(second))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(first))
+    started_s, pid = running_launches.process_start_s()
+    launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    running_launches.announce(launch)
+    monkeypatch.setattr(tempfile, "tempdir", str(second))
+    assert running_launches.find_launch(None) == launch
+    running_launches.withdraw()
+    assert not list(first.glob("*/*.json"))
+
+
 def test_a_runtime_directory_of_another_user_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """As after `su` or `sudo -E`."""
     temporary, runtime, folder = tmp_path / "tmp", tmp_path / "runtime", tmp_path / "run"
