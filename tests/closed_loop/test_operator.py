@@ -144,6 +144,20 @@ def test_a_goto_on_the_way_down_does_not_sink_on() -> None:
     assert max(float(row["pos_ned_m"][2]) for row in flight.truth if row["t_us"] > begun_us) < begun_m + 3.0
 
 
+def test_resume_from_a_low_place_does_not_sink_with_the_mission_into_the_ground() -> None:
+    """A helix between 2 m and 12 m above the ground; a vehicle 2 m high is resumed as the reference sinks."""
+    helix = ("mission.kind=helix", "mission.helix.center_ned_m=[0,0,-2]", "mission.helix.height_m=10")
+    starts = ("swarm.agents=1", "start.positions_ned_m=[[3,0,-2]]", "sitl.ground_z_m=0", "mission.duration_s=60")
+    flight = Lockstep(load(None, (*COARSE, *starts, *helix)))
+    fly_until(flight, lambda: phase(flight) is Phase.TRACK)
+    flight.command("goto", 0, north_m=43.0, east_m=0.0, down_m=-2.0, speed_m_s=8.0)
+    fly_for(flight, 20.0)
+    flight.command("resume", 0)
+    fly_until(flight, lambda: phase(flight) > Phase.TRACK)
+    assert outcome(flight) == "completed"
+    assert max(float(row["pos_ned_m"][2]) for row in flight.truth if row["t_us"] > 2e7) < -1.5
+
+
 def test_a_point_in_an_obstacle_is_refused_and_one_that_an_obstacle_takes_later_is_told() -> None:
     flight = in_the_air(5.0)
     log = flight.logs[0].events

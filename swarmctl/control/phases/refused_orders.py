@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from swarmctl.control.reference.feasibility import LEAST_HEIGHT_M
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.obstacle import Obstacle, taken_by
 from swarmctl.core.operator_verbs import FAR, FAR_M, GOTO, OPERATOR_VERBS, POINT, Order
@@ -33,7 +34,8 @@ class OrderSituation:
     lands_in_place: bool  # it is landing where it came to rest
     controls: bool  # the autopilot follows the agent's setpoints
     paused: bool  # it rests because a peer is silent or deadlines are missed
-    lowest_m: float  # down coordinate that it may not go below
+    lowest_m: float  # down coordinate that no point to go to may be below
+    ground_z_m: float | None  # down coordinate of the place of the take-off; None where it is not known
     way_ned_m: Array | None  # (K, 3) on which it would join a mission that is ordered; None where it does not at once
     contains: Contains
     volume: FlightVolume | None  # that plans keep to
@@ -63,7 +65,7 @@ def refusal_of(order: Order, situation: OrderSituation) -> str:
     if phase is Phase.TAKEOFF and order.verb == "hold" and situation.other_control:
         return f"its pilot or autopilot flies it in {situation.state.mode.name}"
     if situation.way_ned_m is not None:
-        return _way_refusal(situation.way_ned_m, situation)
+        return _low_way_refusal(situation.way_ned_m, situation) or _way_refusal(situation.way_ned_m, situation)
     return _goto_refusal(order, situation.state, situation) if order.verb == GOTO else ""
 
 
@@ -85,6 +87,17 @@ def _goto_refusal(order: Order, state: VehicleState, situation: OrderSituation) 
         return f"{point_text(target)} is in {taken}, where it would never arrive"
     points = min(_MOST_WAY_POINTS, 2 + int(math.dist(state.pos_ned_m[:2], target[:2]) / _WAY_STEP_M))
     return _way_refusal(np.linspace(target, state.pos_ned_m, points), situation)
+
+
+def _low_way_refusal(way_ned_m: Array, situation: OrderSituation) -> str:
+    """Return that a way (K, 3) leads too near to the ground, nearer than where it begins, or ""."""
+    if situation.ground_z_m is None:
+        return ""
+    lowest_m, least_m = float(way_ned_m[:, 2].max()), situation.ground_z_m - LEAST_HEIGHT_M
+    if lowest_m <= max(least_m, float(way_ned_m[0, 2])):
+        return ""
+    least = f"less than {LEAST_HEIGHT_M:g} m above the place of the take-off"
+    return f"the way into the mission leads down to z = {lowest_m:.2f} m, {least}"
 
 
 def _way_refusal(way_ned_m: Array, situation: OrderSituation) -> str:

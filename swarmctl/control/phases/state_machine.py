@@ -137,6 +137,7 @@ class MissionStateMachine:
             controls=mission.had_control,
             paused=mission.interruptions.paused,
             lowest_m=lowest_m,
+            ground_z_m=mission.ground_z_m,
             way_ned_m=obeyed_orders.way_into(mission, order, utc_us, state),
             contains=mission.contains,
             volume=mission.volume,

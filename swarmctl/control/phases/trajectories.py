@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from swarmctl.control.phases.way_back import WayBack, way_back
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.types import Array, VehicleState
@@ -36,7 +37,7 @@ class OfferedMission:
 
 
 class Trajectories:
-    """Owns the transit or stop under way, its destination and the offset that decays to the mission's reference.
+    """Owns the transit or stop under way, its destination and the way back into the mission.
 
     Args:
         mission: reference of the tracked mission.
@@ -63,7 +64,7 @@ class Trajectories:
         self._speed_m_s, self._accel_m_s2, self._brake_m_s2 = speed_m_s, accel_m_s2, brake_m_s2
         self.current: BegunTrajectory | None = None
         self.destination_ned_m = start_ned_m
-        self._rejoin_offset: BegunTrajectory | None = None  # decaying offset to the mission's reference
+        self._way_back: WayBack | None = None
 
     def reference(self, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
         """Return positions and velocities outside of the mission, (K, 3) each, at `offsets_s` (K,) from now."""
@@ -72,21 +73,19 @@ class Trajectories:
         return np.tile(self._start_ned_m, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
 
     def mission_reference(self, mission_t_s: float, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
-        """Return the mission's positions and velocities, (K, 3) each, with what is left of the offset to it."""
+        """Return the mission's positions and velocities, (K, 3) each, or those of the way back to it."""
         pos, vel = self._mission.sample(mission_t_s + offsets_s)
-        if self._rejoin_offset is not None:
-            offset, drift = self._rejoin_offset.sample(now_us, offsets_s)
-            pos, vel = pos + offset, vel + drift
-        return pos, vel
+        way = self._way_back
+        return (pos, vel) if way is None else way.sample(way.elapsed_s(now_us) + offsets_s, pos, vel)
 
     def rejoins(self, now_us: int) -> bool:
-        """Return whether there is an offset left to the mission's reference."""
-        offset = self._rejoin_offset
-        return offset is not None and (now_us - offset.began_us) * 1e-6 < offset.trajectory.travel_s
+        """Return whether the way back to the mission's reference is under way."""
+        way = self._way_back
+        return way is not None and way.elapsed_s(now_us) < max(way.travel_s, way.shed_s)
 
     def change_mission(self, mission: MissionReference) -> None:
         """Follow another mission from now on."""
-        self._mission, self._rejoin_offset = mission, None
+        self._mission, self._way_back = mission, None
 
     def stand(self, now_us: int, state: VehicleState) -> None:
         """Begin to stay at the vehicle's place, as if it were at rest."""
@@ -119,20 +118,18 @@ class Trajectories:
             self.destination_ned_m = self.current.trajectory.to_ned_m
 
     def rejoin_mission(self, mission_t_s: float, now_us: int, state: VehicleState) -> None:
-        """Rejoin the mission's moving reference along a quintic offset: after a jump all agents would rush together."""
-        way = self._offset_to(self._mission, mission_t_s, state)
-        self._rejoin_offset = BegunTrajectory(trajectory=way, began_us=now_us)
+        """Rejoin the mission's moving reference on a smooth way: after a jump all agents would rush together."""
+        self._way_back = self._way_to(self._mission, mission_t_s, now_us, state)
 
     def way_into(self, mission: MissionReference, mission_t_s: float, state: VehicleState) -> Array:
         """Return points (K, 3) of the way on which a mission's moving reference would be joined."""
-        way = self._offset_to(mission, mission_t_s, state)
+        way = self._way_to(mission, mission_t_s, 0, state)
         t_s = np.linspace(0.0, way.travel_s, _WAY_POINTS)
-        return np.asarray(mission.sample(mission_t_s + t_s)[0] + way.sample(t_s)[0])
+        return way.sample(t_s, *mission.sample(mission_t_s + t_s))[0]
 
-    def _offset_to(self, mission: MissionReference, mission_t_s: float, state: VehicleState) -> QuinticTrajectory:
-        pos, vel = mission.sample(np.array([mission_t_s]))
-        offset, drift = state.pos_ned_m - pos[0], state.vel_ned_m_s - vel[0]
-        return quintic_to(offset, drift, np.zeros(3), self._speed_m_s, accel_m_s2=self._accel_m_s2)
+    def _way_to(self, mission: MissionReference, mission_t_s: float, now_us: int, state: VehicleState) -> WayBack:
+        speed_m_s, accel_m_s2 = self._speed_m_s, self._accel_m_s2
+        return way_back(mission, mission_t_s, now_us, state, speed_m_s=speed_m_s, accel_m_s2=accel_m_s2)
 
     def _begin(self, trajectory: QuinticTrajectory, now_us: int) -> None:
         self.current = BegunTrajectory(trajectory=trajectory, began_us=now_us)

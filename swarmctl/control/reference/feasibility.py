@@ -24,7 +24,7 @@ from swarmctl.core.types import Array
 _STEP_S = 0.02  # time between samples
 _MAX_SAMPLES = 200_000  # of all agents together; long missions of many are sampled more coarsely
 _JUMP_M = 0.02  # difference of positions that velocities need not explain
-_GROUND_M = 0.3  # least height of a reference: bodies have legs
+LEAST_HEIGHT_M = 0.3  # least height of a reference: bodies have legs
 _OUTSIDE_M = 1e-6  # of flight volume and geofence: rounding
 _SHOWN = 3  # problems
 
@@ -124,8 +124,8 @@ def _rules(
         )
     ]
     if limits.ground_z_m is not None:
-        low = pos[:, 2] > limits.ground_z_m - _GROUND_M
-        below = f"less than {_GROUND_M:g} m above the ground at {limits.ground} = {limits.ground_z_m:.4g} (NED)"
+        low = pos[:, 2] > limits.ground_z_m - LEAST_HEIGHT_M
+        below = f"less than {LEAST_HEIGHT_M:g} m above the ground at {limits.ground} = {limits.ground_z_m:.4g} (NED)"
         ground = f"the reference is at z = {{}} m, {below}"
         rules.append(_Rule(broken=low & finite, said=ground, values=pos[:, 2]))
     if limits.volume is not None:

@@ -26,22 +26,22 @@ class QuinticTrajectory:
     def sample(self, t_s: Array) -> tuple[Array, Array]:
         """Return positions and velocities, (K, 3) each, at times `t_s` (K,) [s] since the start."""
         shed_s = self.travel_s if self.shed_s is None else self.shed_s
-        blend, slope = _to_target(t_s / self.travel_s)
-        coast, coast_slope = _out_and_back(t_s / shed_s)
+        blend, slope = to_target(t_s / self.travel_s)
+        coast, coast_slope = out_and_back(t_s / shed_s)
         delta = self.to_ned_m - self.from_ned_m
         pos = self.from_ned_m + blend * delta + coast * (shed_s * self.vel_ned_m_s)
         vel = slope * delta / self.travel_s + coast_slope * self.vel_ned_m_s
         return pos, vel
 
 
-def _to_target(elapsed_01: Array) -> tuple[Array, Array]:
+def to_target(elapsed_01: Array) -> tuple[Array, Array]:
     """Return the polynomial from 0 to 1, at rest at both ends, and its slope, (K, 1) each."""
     s = np.clip(elapsed_01, 0.0, 1.0)[:, None]
     s2, s3 = s**2, s**3
     return s3 * (10.0 - 15.0 * s + 6.0 * s2), 30.0 * s2 * (1.0 - s) ** 2
 
 
-def _out_and_back(elapsed_01: Array) -> tuple[Array, Array]:
+def out_and_back(elapsed_01: Array) -> tuple[Array, Array]:
     """Return the polynomial from 0 to 0, with slope 1 at its beginning and at rest at its end, and its slope."""
     s = np.clip(elapsed_01, 0.0, 1.0)[:, None]
     s2, s3, s4 = s**2, s**3, s**4

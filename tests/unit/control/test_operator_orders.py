@@ -108,6 +108,15 @@ def test_each_verb_in_each_phase_has_its_effect_or_is_refused_with_a_reason(verb
         assert (mission.phase, mission.held, mission.outcome) == before
 
 
+@pytest.mark.parametrize("sinks_m_s", [0.2, 1.5])
+def test_a_mission_is_refused_into_which_a_vehicle_would_sink_too_near_to_the_ground(sinks_m_s: float) -> None:
+    flight = controlled(Phase.TRACK)
+    flight.mission.offered = OFFERED
+    flight.pos, flight.vel = np.array([1.0, 0.0, -0.5]), np.array([0.0, 0.0, sinks_m_s])
+    refusal = flight.ask(MISSION, **{MISSION: 1.0, BEGIN: flight.utc_us * 1e-6})
+    assert ("the way into the mission leads down to z = " in refusal) is (sinks_m_s > 1.0)
+
+
 def test_every_verb_about_the_vehicle_is_a_stop_or_handled() -> None:
     assert {name for name in ABOUT_THE_VEHICLE if not OPERATOR_VERBS[name].is_stop} == ORDERS.keys()
 
