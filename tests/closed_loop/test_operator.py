@@ -158,6 +158,20 @@ def test_resume_from_a_low_place_does_not_sink_with_the_mission_into_the_ground(
     assert max(float(row["pos_ned_m"][2]) for row in flight.truth if row["t_us"] > 2e7) < -1.5
 
 
+def test_a_hold_on_the_way_down_stops_above_the_ground() -> None:
+    """From 4 m/s the stop of transits, at 0.6 m/s^2 on average, leads from 4 m above the ground into it."""
+    points = "mission.waypoints.lists=[{points_ned_m=[[0,0,-12],[20,0,-1.5]]}]"
+    sinks = ("mission.kind=waypoints", points, "mission.waypoints.speed_m_s=4", "mission.waypoints.accel_m_s2=3")
+    starts = ("swarm.agents=1", "start.positions_ned_m=[[0,0,-12]]", "sitl.ground_z_m=0", "mission.duration_s=20")
+    flight = Lockstep(load(None, (*COARSE, *starts, *sinks)))
+    fly_until(flight, lambda: phase(flight) is Phase.TRACK and vehicle(flight)[0][2] > -4.0)
+    begun_us = flight.clock.now_us()
+    flight.command("hold", 0)
+    fly_for(flight, 8.0)
+    assert np.linalg.norm(vehicle(flight)[1]) < 0.1
+    assert max(float(row["pos_ned_m"][2]) for row in flight.truth if row["t_us"] > begun_us) < -0.3
+
+
 def test_a_point_in_an_obstacle_is_refused_and_one_that_an_obstacle_takes_later_is_told() -> None:
     flight = in_the_air(5.0)
     log = flight.logs[0].events

@@ -236,6 +236,7 @@ class MissionState:
     def enter(self, phase: Phase, now_us: int) -> None:
         """Enter a phase; its requests may be made at once."""
         self.phase = phase
+        self.trajectories.ground_z_m = self.ground_z_m
         if phase >= Phase.LAND:
             self.interruptions.end_hold()
             self.end_way_back("did not get back")

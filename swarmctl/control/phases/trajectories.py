@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from swarmctl.control.phases.way_back import WayBack, way_back
 from swarmctl.control.reference.mission import MissionReference
-from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
+from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to, shedding_s
 from swarmctl.core.types import Array, VehicleState
 
 _WAY_POINTS = 300  # of a way that is checked
+_LEAST_HEIGHT_M = 0.5  # above the ground, to which a vehicle may be carried as it stops or turns round
+_HARDER = 8  # decelerations that are tried, from that of transits up, until one keeps above the ground
+_LOW_POINTS = 60  # of a way whose lowest point is looked for
+_OF_SHEDDING = 1.15  # most deceleration at which a velocity is shed, over `brake_m_s2`: the peak of a stop at once
+
+W = TypeVar("W")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +57,7 @@ class Trajectories:
     Attributes:
         current: transit or stop that began last, None before the first.
         destination_ned_m: (3,) end of the transit that a pause or a hold interrupts.
+        ground_z_m: down coordinate of the place of the take-off; None where it is not known.
     """
 
     def __init__(
@@ -64,6 +73,7 @@ class Trajectories:
         self._speed_m_s, self._accel_m_s2, self._brake_m_s2 = speed_m_s, accel_m_s2, brake_m_s2
         self.current: BegunTrajectory | None = None
         self.destination_ned_m = start_ned_m
+        self.ground_z_m: float | None = None
         self._way_back: WayBack | None = None
 
     def reference(self, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
@@ -95,15 +105,32 @@ class Trajectories:
         self._begin(here, now_us)
 
     def stop(self, now_us: int, state: VehicleState, *, at_once: bool = False) -> None:
-        """Begin to brake to rest, smoothly or at once."""
-        accel_m_s2 = max(self._accel_m_s2, 2.0 * self._brake_m_s2) if at_once else self._accel_m_s2
-        self._begin(brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, accel_m_s2), now_us)
+        """Begin to brake to rest, smoothly or at once; harder where a vehicle that sinks would come near the ground."""
+        pos, vel, most_m_s2 = state.pos_ned_m, state.vel_ned_m_s, max(self._accel_m_s2, 2.0 * self._brake_m_s2)
+        least_m_s2 = most_m_s2 if at_once else self._accel_m_s2
+        braked = self._above_ground(
+            state,
+            (least_m_s2, most_m_s2),
+            lambda accel_m_s2: brake_to_rest(pos, vel, accel_m_s2),
+            lambda found: float(found.to_ned_m[2]),
+        )
+        if self.ground_z_m is not None and braked.to_ned_m[2] > (lowest_m := self._lowest_m(state)):
+            braked = replace(braked, to_ned_m=np.array([*braked.to_ned_m[:2], lowest_m]))
+        self._begin(braked, now_us)
 
     def go_to(self, target_ned_m: Array, now_us: int, state: VehicleState, speed_m_s: float | None = None) -> None:
         """Begin a transit to a target (3,), at the peak speed of transits or another one."""
-        speed_m_s = self._speed_m_s if speed_m_s is None else speed_m_s
-        transit = quintic_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, speed_m_s, accel_m_s2=self._accel_m_s2)
-        self._begin(transit, now_us)
+        peak_m_s = self._speed_m_s if speed_m_s is None else speed_m_s
+        pos, vel, accel_m_s2 = state.pos_ned_m, state.vel_ned_m_s, self._accel_m_s2
+
+        def shed(shed_m_s2: float) -> QuinticTrajectory:
+            shed_s = shedding_s(vel, shed_m_s2)
+            return quintic_to(pos, vel, target_ned_m, peak_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
+
+        def lowest_m(found: QuinticTrajectory) -> float:
+            return float(found.sample(np.linspace(0.0, found.travel_s, _LOW_POINTS))[0][:, 2].max())
+
+        self._begin(self._above_ground(state, self._sheds_m_s2, shed, lowest_m, float(target_ned_m[2])), now_us)
 
     def is_left(self, now_us: int, state: VehicleState, away_m: float) -> bool:
         """Return whether the present trajectory is over and the vehicle farther than that from its end."""
@@ -128,8 +155,56 @@ class Trajectories:
         return way.sample(t_s, *mission.sample(mission_t_s + t_s))[0]
 
     def _way_to(self, mission: MissionReference, mission_t_s: float, now_us: int, state: VehicleState) -> WayBack:
-        speed_m_s, accel_m_s2 = self._speed_m_s, self._accel_m_s2
-        return way_back(mission, mission_t_s, now_us, state, speed_m_s=speed_m_s, accel_m_s2=accel_m_s2)
+        limits = {"speed_m_s": self._speed_m_s, "accel_m_s2": self._accel_m_s2}
+
+        def shed(shed_m_s2: float) -> WayBack:
+            shed_s = shedding_s(state.vel_ned_m_s, shed_m_s2)
+            return way_back(mission, mission_t_s, now_us, state, **limits, shed_s=shed_s)
+
+        def below_mission_m(found: WayBack) -> float:
+            t_s = np.linspace(0.0, found.travel_s, _LOW_POINTS)
+            pos, vel = mission.sample(mission_t_s + t_s)
+            lowest_m = float(found.sample(t_s, pos, vel)[0][:, 2].max())
+            return -math.inf if lowest_m <= pos[:, 2].max() else lowest_m
+
+        return self._above_ground(state, self._sheds_m_s2, shed, below_mission_m)
+
+    @property
+    def _sheds_m_s2(self) -> tuple[float, float]:
+        """Return the least and the most deceleration at which a first velocity is shed."""
+        return self._accel_m_s2, max(self._accel_m_s2, _OF_SHEDDING * self._brake_m_s2)
+
+    def _lowest_m(self, state: VehicleState) -> float:
+        """Return the down coordinate to which a vehicle may be carried; one that is lower already, where it is."""
+        here_m = float(state.pos_ned_m[2])
+        return here_m if self.ground_z_m is None else max(self.ground_z_m - _LEAST_HEIGHT_M, here_m)
+
+    def _above_ground(
+        self,
+        state: VehicleState,
+        between_m_s2: tuple[float, float],
+        way: Callable[[float], W],
+        lowest_m: Callable[[W], float],
+        end_m: float = -math.inf,
+    ) -> W:
+        """Return the way with the least deceleration that keeps above the ground, or with the most.
+
+        Args:
+            state: of the vehicle.
+            between_m_s2: least and most deceleration.
+            way: returns the way with a deceleration.
+            lowest_m: returns the down coordinate of its lowest point.
+            end_m: down coordinate where it is meant to end.
+        """
+        least_m_s2, most_m_s2 = between_m_s2
+        found = way(least_m_s2)
+        if self.ground_z_m is None or state.vel_ned_m_s[2] <= 0.0:
+            return found
+        for harder_m_s2 in np.geomspace(least_m_s2, most_m_s2, _HARDER)[1:].tolist():
+            if lowest_m(found) <= max(self._lowest_m(state), end_m):
+                return found
+            found = way(harder_m_s2)
+        return found
 
     def _begin(self, trajectory: QuinticTrajectory, now_us: int) -> None:
         self.current = BegunTrajectory(trajectory=trajectory, began_us=now_us)

@@ -76,6 +76,7 @@ def way_back(
     *,
     speed_m_s: float,
     accel_m_s2: float,
+    shed_s: float,
 ) -> WayBack:
     """Return the way into a mission from where a vehicle is.
 
@@ -87,16 +88,17 @@ def way_back(
         now_us: monotonic time.
         state: of the vehicle.
         speed_m_s, accel_m_s2: peaks of a transit.
+        shed_s: time in which its velocity decays.
     """
     pos, vel = mission.sample(np.array([mission_t_s]))
-    transit = quintic_to(state.pos_ned_m, state.vel_ned_m_s, pos[0], speed_m_s, accel_m_s2=accel_m_s2)
-    assert transit.shed_s is not None
+    here, first_m_s = state.pos_ned_m, state.vel_ned_m_s
+    transit = quintic_to(here, first_m_s, pos[0], speed_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
     way = WayBack(
         began_us=now_us,
-        from_ned_m=state.pos_ned_m,
-        vel_ned_m_s=state.vel_ned_m_s,
+        from_ned_m=here,
+        vel_ned_m_s=first_m_s,
         travel_s=max(transit.travel_s, 3.0 * _longest(vel) / accel_m_s2),
-        shed_s=transit.shed_s,
+        shed_s=shed_s,
     )
     for _ in range(_MOST_LONGER):
         reference = mission.sample(mission_t_s + np.linspace(0.0, way.travel_s, _POINTS))

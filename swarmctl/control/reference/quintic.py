@@ -48,17 +48,23 @@ def out_and_back(elapsed_01: Array) -> tuple[Array, Array]:
     return s - 6.0 * s3 + 8.0 * s4 - 3.0 * s**5, 1.0 - 18.0 * s2 + 32.0 * s3 - 15.0 * s4
 
 
-def quintic_to(pos: Array, vel: Array, target: Array, speed_m_s: float, *, accel_m_s2: float) -> QuinticTrajectory:
+def quintic_to(
+    pos: Array, vel: Array, target: Array, speed_m_s: float, *, accel_m_s2: float, shed_s: float | None = None
+) -> QuinticTrajectory:
     """Return the fastest `QuinticTrajectory` whose peak speed and acceleration stay near the given ones.
 
-    A quintic from rest peaks at 1.875 of its mean speed and at 5.77 distance / T^2. The first velocity is shed as soon
-    as the acceleration allows: over a long way it would carry the vehicle far beyond where it came from.
+    A quintic from rest peaks at 1.875 of its mean speed and at 5.77 distance / T^2. The first velocity is shed in
+    `shed_s`, or as soon as the acceleration allows: over a long way it would carry the vehicle far beyond its start.
     """
     distance = math.dist(pos, target)
-    initial = math.sqrt(float(vel @ vel))
-    shed_s = max(0.5, 3.0 * initial / accel_m_s2)
+    shed_s = shedding_s(vel, accel_m_s2) if shed_s is None else shed_s
     travel_s = max(1.875 * distance / speed_m_s, math.sqrt(5.77 * distance / accel_m_s2), shed_s)
     return QuinticTrajectory(from_ned_m=pos, vel_ned_m_s=vel, to_ned_m=target, travel_s=travel_s, shed_s=shed_s)
+
+
+def shedding_s(vel: Array, accel_m_s2: float) -> float:
+    """Return the time in which a first velocity (3,) is shed, near an acceleration: at 1.31 of that at its peak."""
+    return max(0.5, 3.0 * math.sqrt(float(vel @ vel)) / accel_m_s2)
 
 
 def brake_to_rest(pos: Array, vel: Array, accel_m_s2: float) -> QuinticTrajectory:

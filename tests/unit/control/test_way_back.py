@@ -9,6 +9,7 @@ import pytest
 
 from swarmctl.control.phases.way_back import WayBack, way_back
 from swarmctl.control.reference.mission import MissionParams, MissionReference
+from swarmctl.control.reference.quintic import shedding_s
 from swarmctl.core.types import Array
 from tests import builders
 
@@ -25,7 +26,8 @@ def reference_of(mission: dict[str, Any]) -> MissionReference:
 
 def way_from(pos: tuple[float, ...], vel: tuple[float, ...], reference: MissionReference, begins_s: float) -> WayBack:
     state = builders.vehicle_state(pos_ned_m=np.array(pos), vel_ned_m_s=np.array(vel))
-    return way_back(reference, begins_s, 0, state, speed_m_s=SPEED_M_S, accel_m_s2=ACCEL_M_S2)
+    limits = {"speed_m_s": SPEED_M_S, "accel_m_s2": ACCEL_M_S2, "shed_s": shedding_s(state.vel_ned_m_s, ACCEL_M_S2)}
+    return way_back(reference, begins_s, 0, state, **limits)
 
 
 def flown(way: WayBack, reference: MissionReference, begins_s: float) -> tuple[Array, Array, Array]:
