@@ -21,6 +21,7 @@ from swarmctl.control.phases.landing import Landing
 from swarmctl.control.phases.refused_orders import Contains
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.phases.trajectories import OfferedMission, Trajectories
+from swarmctl.control.reference.feasibility import below_ground
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.types import Array, Command, ControlMode, Landed, Mode, Phase, VehicleState
@@ -131,8 +132,13 @@ class MissionState:
 
     @property
     def ground_z_m(self) -> float | None:
-        """Return the down coordinate of the place that the vehicle took off from; None where that is not known."""
-        return None if self.airborne or self.phase < Phase.TAKEOFF else self.climb.ground_z_m
+        """Return the down coordinate of the place that the vehicle takes off from; None where that is not known."""
+        return None if self.airborne or self.phase < Phase.ARM else self.climb.ground_z_m
+
+    @property
+    def leads_below_ground(self) -> str:
+        """Return where the mission leads below the place that the vehicle takes off from, or ""."""
+        return below_ground(self.mission_reference, self.duration_us * 1e-6, self.climb.ground_z_m)
 
     @property
     def yaw_rad(self) -> float | None:

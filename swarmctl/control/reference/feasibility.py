@@ -25,6 +25,8 @@ _STEP_S = 0.02  # time between samples
 _MAX_SAMPLES = 200_000  # of all agents together; long missions of many are sampled more coarsely
 _JUMP_M = 0.02  # difference of positions that velocities need not explain
 LEAST_HEIGHT_M = 0.3  # least height of a reference: bodies have legs
+_ESTIMATED_M = 0.25  # by which heights of the place of a take-off are wrong
+_GROUND_SAMPLES = 5000  # of a mission that is checked against that place, within a part of a tick
 _OUTSIDE_M = 1e-6  # of flight volume and geofence: rounding
 _SHOWN = 3  # problems
 
@@ -83,6 +85,24 @@ def infeasible(
     yield from found[:_SHOWN]
     if len(found) > _SHOWN:
         yield f"mission: {len(found) - _SHOWN} more agents or pairs of agents have references that can't be flown"
+
+
+def below_ground(reference: MissionReference, duration_s: float, ground_z_m: float) -> str:
+    """Return where a mission leads below the place of a take-off, which is known once a vehicle stands there, or "".
+
+    A show may end on the ground, and heights are estimates.
+
+    Args:
+        reference: of one agent.
+        duration_s: of the mission.
+        ground_z_m: down coordinate of the place.
+    """
+    t_s = np.linspace(0.0, duration_s, _GROUND_SAMPLES)
+    down_m = reference.sample(t_s)[0][:, 2]
+    below = f"the reference is at z = {{}} m, below the place of the take-off at z = {ground_z_m:.2f}"
+    said = f"{below}; give heights as NED, down is positive, or correct swarm.origin_alt_m"
+    found = _first(t_s, [_Rule(broken=down_m > ground_z_m + _ESTIMATED_M, said=said, values=down_m)])
+    return f"mission: {found[0]}" if found else ""
 
 
 def _cut_short(references: Sequence[MissionReference], duration_s: float) -> Iterator[str]:

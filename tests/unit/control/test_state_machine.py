@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.phases.inputs import PeerInputs
+from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Command, FlightMode, Mode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, SECOND, START, UTC0_US, Flight, ready
@@ -148,6 +149,7 @@ def test_what_comes_after_all_have_stood_by_still_keeps_a_vehicle_from_being_arm
 @pytest.mark.parametrize(("ground_z_m", "is_armed"), [(-2.4, True), (-2.6, True), (-2.8, False), (-8.0, False)])
 def test_who_stands_as_high_as_its_start_is_not_armed(ground_z_m: float, is_armed: bool) -> None:
     flight = Flight(peers=0)
+    flight.mission.mission_reference = MissionReference(MissionParams(kind="hover"), START[None, :], 0)
     flight.pos = np.array([1.0, 0.0, ground_z_m])
     assert (Verb.ARM in flight.run(3.0)) == is_armed
     if not is_armed:
@@ -168,6 +170,29 @@ def test_takeoff_height_is_from_the_ground_it_stands_on() -> None:
     flight.until(Phase.TAKEOFF)
     (command,) = flight.step()
     assert command == Command(verb=Verb.TAKEOFF, value=3.5)
+
+
+def told_to_fly_to(down_m: float) -> Flight:
+    """Return a flight on the ground, at z = 0, of a mission that ends at a height, NED z."""
+    flight = Flight()
+    goto = {"goals_ned_m": [(10.0, 0.0, down_m)], "goal_assignment": False}
+    told = MissionParams.model_validate({"kind": "goto", "goto": goto})
+    flight.mission.mission_reference = MissionReference(told, START[None, :], 0)
+    return flight
+
+
+def test_a_mission_that_leads_below_the_place_of_the_take_off_is_not_begun() -> None:
+    """The ground of real vehicles is known once they stand on it; a height was given as positive upwards."""
+    flight = told_to_fly_to(2.0)
+    assert Verb.ARM not in flight.run(3.0)
+    assert flight.at == "DONE"
+    assert "the reference is at z = 0.2" in flight.mission.outcome
+    assert "below the place of the take-off at z = 0.00; give heights as NED" in flight.mission.outcome
+
+
+@pytest.mark.parametrize("down_m", [-1.0, 0.0, 0.2])
+def test_a_mission_that_ends_on_the_ground_as_far_as_that_is_known_is_flown(down_m: float) -> None:
+    told_to_fly_to(down_m).until(Phase.TAKEOFF)
 
 
 def test_takeoff_is_over_when_it_hovers_at_its_height() -> None:

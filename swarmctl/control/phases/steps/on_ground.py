@@ -26,7 +26,7 @@ def standby(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> 
     if not mission.waits_for:
         mission.climb.begin(state)
         mission.airborne = state.landed is Landed.IN_AIR
-        if not mission.airborne and (too_low := mission.climb.too_low):
+        if not mission.airborne and (too_low := mission.climb.too_low or mission.leads_below_ground):
             return mission.refuse(too_low, inputs)
         # however long others were waited for, the way to the start has its time:
         mission.patient_from_us = inputs.now_us
