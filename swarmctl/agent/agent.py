@@ -317,7 +317,7 @@ class Agent:
             state,
             flies=self._modes.mode in FLOWN_BY_AGENT,
             committed_peers=self._planner.directive.committed_peers,
-            reference=planning.reference,
+            followed_z_m=planning.followed_z_m,
         )
         if setpoint is not None:
             self._vehicle_watch.report_gap(now_us, self._deadlines.stop_cause(now_us))

@@ -11,12 +11,13 @@ from swarmctl.core.types import Array, AttitudeSetpoint, Mode, Plan, Reference
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanningResult:
-    """Result of the planning part of a tick; all but `keep_outs` is None while the own state is stale."""
+    """Result of the planning part of a tick; what may be is None while the own state is stale."""
 
     start: Start | None
     plan: Plan | None  # also None while the autopilot flies
     reference: Reference | None  # the mission's reference now, one point
     keep_outs: list[KeepOut]
+    followed_z_m: float | None = None  # down coordinate now of what is followed, in a hold too
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

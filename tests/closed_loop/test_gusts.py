@@ -14,6 +14,7 @@ from sitl.studies.campaign.conditions.events import SimulatorFault
 from sitl.studies.campaign.flight import TrialFlight, drawn
 from sitl.studies.campaign.trials import Trial
 from swarmctl.agent.flying import setpoint_output
+from swarmctl.agent.planning.reference_selector import ReferenceSelector
 from swarmctl.agent.watches.alerts import Alert
 from swarmctl.bus.peers.clocks import PeerClocks
 from swarmctl.config import Config, load
@@ -123,6 +124,28 @@ def test_a_wind_that_thrust_does_not_hold_costs_place_and_not_height(
     assert "too low: tilts no more than its thrust holds" in told
     monkeypatch.setattr(setpoint_output, "holding_height", lambda virtual_control, *_: virtual_control)
     assert sunken_in_wind(11.0, towards_deg)[0] > 5.0
+
+
+def drifted_in_hold_m() -> float:
+    """Return how far a wind of 7 m/s, after 20 s, has carried one that is held below a mission that climbs on."""
+    blows = "sitl.faults=[{kind='wind',vehicle=0,at_s=30,value=7,towards_deg=0}]"
+    climbs = ("sitl.start=air", "swarm.agents=1", "mission.duration_s=60", "mission.circle.climb_ned_m_s=-0.3", blows)
+    flight = fly_now(
+        *climbs,
+        "controller.mpc.thrust_max_m_s2=12.5",
+        config=X500.name,
+        at={3.0: lambda running: running.command("hold")},
+        until=lambda running: running.clock.now_us() >= 50_000_000,
+    )
+    before = int(np.searchsorted(flight.t_s, 29.0))
+    return float(np.linalg.norm(flight.pos_ned_m[-1, 0] - flight.pos_ned_m[before, 0]))
+
+
+def test_who_is_held_below_a_mission_that_climbs_has_not_sunk(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert drifted_in_hold_m() < 3.0
+    of_mission = property(lambda references: float(references.reference(np.zeros(3))[1].pos_ned_m[0, 2]))
+    monkeypatch.setattr(ReferenceSelector, "followed_z_m", of_mission)
+    assert drifted_in_hold_m() > 20.0, "negative control"
 
 
 def blown_farther_than_expected(*sets: str, too_close_m: float = 0.0) -> CollisionMonitor:

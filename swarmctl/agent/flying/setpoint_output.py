@@ -15,7 +15,7 @@ from swarmctl.control.reference.heading import Heading
 from swarmctl.control.setpoint import SetpointHold, holding_height, setpoint_of, within_tilt
 from swarmctl.core.frames import euler_from_quat
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.types import Array, AttitudeSetpoint, Plan, Reference, VehicleState
+from swarmctl.core.types import Array, AttitudeSetpoint, Plan, VehicleState
 
 
 class SetpointOutput:
@@ -55,7 +55,7 @@ class SetpointOutput:
         *,
         flies: bool,
         committed_peers: Mapping[int, Sequence[Trajectory]],
-        reference: Reference | None,
+        followed_z_m: float | None,
     ) -> AttitudeSetpoint | None:
         """Send the command of a plan that acts when the setpoint arrives; returns what has been sent.
 
@@ -66,7 +66,7 @@ class SetpointOutput:
             state: newest one of the vehicle.
             flies: the agent flies the vehicle in this tick's mode.
             committed_peers: trajectories that peers have committed to.
-            reference: of the mission now; None if unknown.
+            followed_z_m: down coordinate now of the reference that is followed; None if unknown.
         """
         if flown is None or start is None:
             self._safety_filter.skip(now_us)
@@ -77,7 +77,7 @@ class SetpointOutput:
         virtual_control = self._safety_filter.keep_apart(
             now_us,
             self._ports.utc_of_us(act_us),
-            self._holding_height(now_us, flown.virtual_control[step], state, reference),
+            self._holding_height(now_us, flown.virtual_control[step], state, followed_z_m),
             start,
             estimate=estimate,
             flies=flies,
@@ -96,12 +96,12 @@ class SetpointOutput:
         return setpoint
 
     def _holding_height(
-        self, now_us: int, virtual_control: Array, state: VehicleState | None, reference: Reference | None
+        self, now_us: int, virtual_control: Array, state: VehicleState | None, followed_z_m: float | None
     ) -> Array:
         """Return a command (3,) that gives up no more height, and say so where it is not the one asked for."""
-        if state is None or reference is None:
+        if state is None or followed_z_m is None:
             return virtual_control
-        below_m = float(state.pos_ned_m[2] - reference.pos_ned_m[0, 2])
+        below_m = float(state.pos_ned_m[2]) - followed_z_m
         held = holding_height(virtual_control, below_m, self._thrust_max_m_s2)
         if held is not virtual_control:
             text = f"{below_m:.1f} m too low: tilts no more than its thrust holds, and may be blown away"

@@ -97,7 +97,8 @@ class Planner:
         plan = self._solve(now_us, start, reference) if flies else None
         if self._rehearsal is not None and Phase.STANDBY <= mission.phase < Phase.GOTO_START:
             self._rehearsal.plan(self._utc_of_us(now_us), start, mission.climb.rest_ned_m(state), keep_outs)
-        return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=list(keep_outs))
+        followed_z_m, known = self._references.followed_z_m, list(keep_outs)
+        return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=known, followed_z_m=followed_z_m)
 
     def reset(self) -> None:
         """Forget what the controllers remember: until now the vehicle was flown by its autopilot."""

@@ -38,6 +38,14 @@ class ReferenceSelector:
         self._left_ned: tuple[Array, Array] | None = None  # the mission's own, (1, 3) each, while that is not followed
         self._reported: Deadlock | None = None
 
+    @property
+    def followed_z_m(self) -> float:
+        """Return the down coordinate now of what the agent follows: its mission, or what interrupts it.
+
+        A commitment is left out: a vehicle that sinks commits anew from where it is.
+        """
+        return float(self._mission_ned[0][0, 2])
+
     def heading_rad(self, utc_us: int) -> float | None:
         """Return the heading [rad] to turn to: the operator's, the mission's while it is followed, or that of the
         configuration before and after it; None while the mission is interrupted: the present one.

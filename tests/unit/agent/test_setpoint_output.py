@@ -24,7 +24,7 @@ from swarmctl.control.collision.barrier import BarrierParams, Body
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.frames import euler_from_quat, quat_from_euler
 from swarmctl.core.trajectory import Trajectory, resting
-from swarmctl.core.types import Array, AttitudeSetpoint, Plan, PlanStatus, Reference, VehicleState
+from swarmctl.core.types import Array, AttitudeSetpoint, Plan, PlanStatus, VehicleState
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.vehicle.setpoint_stream import SetpointStream
 from tests import builders
@@ -109,7 +109,7 @@ class Bench:
         flies: bool = True,
         start: Start | None = None,
         state: VehicleState | None = None,
-        reference: Reference | None = None,
+        followed_z_m: float | None = None,
         committed: Mapping[int, Sequence[Trajectory]] = MappingProxyType({}),
     ) -> list[float] | None:
         """Fly a tick 20 ms after the last; return quaternion and thrust of the frame that has left, if one has."""
@@ -123,7 +123,7 @@ class Bench:
             state or builders.vehicle_state(t_us=self.now_us, pos_ned_m=HERE),
             flies=flies,
             committed_peers=committed,
-            reference=reference,
+            followed_z_m=followed_z_m,
         )
         frames = self.frames[before:]
         assert len(frames) == (setpoint is not None), "one frame for each setpoint that is said to have been sent"
@@ -136,10 +136,6 @@ class Bench:
     def estimate(self, **changes: Any) -> None:
         estimate = replace(self.own_state.estimate, **changes)
         self.own_state._estimator = cast(Any, SimpleNamespace(estimate=estimate))
-
-
-def reference_at(pos_ned_m: Array) -> Reference:
-    return Reference(pos_ned_m=pos_ned_m[None, :], vel_ned_m_s=np.zeros((1, 3)), yaw_rad=0.0)
 
 
 def tilt_of(sent: list[float] | None) -> tuple[float, float]:
@@ -181,7 +177,7 @@ def test_without_a_plan_or_a_start_nothing_leaves_and_nothing_is_remembered() ->
     bench.now_us += 20 * MS
     state = builders.vehicle_state(pos_ned_m=HERE)
     plan = bench.plan(LEVEL)
-    sent = bench.output.send(bench.now_us, plan, None, state, flies=True, committed_peers={}, reference=None)
+    sent = bench.output.send(bench.now_us, plan, None, state, flies=True, committed_peers={}, followed_z_m=None)
     assert sent is None
     assert (bench.frames, bench.remembered, bench.told) == ([], [], [])
 
@@ -207,12 +203,11 @@ def test_a_command_that_is_no_number_never_leaves_and_is_told(
 ) -> None:
     bench = Bench()
     bench.bodies = bodies
-    sunken = reference_at(HERE - np.array([0.0, 0.0, 5.0]))
     assert bench.send(bench.plan(command), flies=flies) is None
     alert = bench.alerts.newest(bench.now_us)
     assert alert is not None
     assert alert.text.startswith("setpoint refused: ")
-    assert bench.send(bench.plan(command), flies=flies, reference=sunken) is None
+    assert bench.send(bench.plan(command), flies=flies, followed_z_m=HERE[2] - 5.0) is None
     assert bench.remembered == [], "what was not sent moves nothing"
     assert [name for name, _ in bench.told if name == "setpoint_refused"] == ["setpoint_refused"] * 2
     bench.bodies = []
@@ -332,8 +327,7 @@ def test_an_encounter_in_which_nothing_is_sent_any_more_ends() -> None:
 def test_who_has_sunk_gives_up_tilt_and_says_so(below_m: float, shortened: bool) -> None:
     bench = Bench("controller.mpc.thrust_max_m_s2=12")
     most = bench.model.u_max()
-    reference = reference_at(HERE - np.array([0.0, 0.0, below_m]))
-    sent = bench.send(bench.plan((0.0, most, 12.0)), reference=reference)
+    sent = bench.send(bench.plan((0.0, most, 12.0)), followed_z_m=HERE[2] - below_m)
     assert bool(tilt_of(sent)[1] < most - 0.02) is shortened
     alert = bench.alerts.newest(bench.now_us)
     assert (alert is not None and alert.text.startswith(f"{below_m:.1f} m too low")) is shortened
