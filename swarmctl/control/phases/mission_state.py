@@ -270,8 +270,14 @@ class MissionState:
         return []
 
     def give_up(self, why: str, inputs: PhaseInputs, state: VehicleState) -> None:
-        """End the mission; only without a plan does the autopilot land the vehicle from where it is."""
+        """End the mission; only without a plan does the autopilot land the vehicle from where it is.
+
+        A vehicle that was found in the air and has not been asked for anything yet is left as it was found.
+        """
         self.outcome = self.outcome or why
+        if self.phase < Phase.ARM and not self.arming.requested:
+            self.enter(Phase.DONE, inputs.now_us)
+            return
         if self.had_control and inputs.mode in PLAN_MODES:
             self.stop_in_place(inputs.now_us, state)
             return

@@ -305,6 +305,21 @@ def test_an_overloaded_agent_waits_on_the_ground_until_the_patience_with_the_sta
     assert flight.mission.outcome == "not tracking after 90 s (STANDBY): its processor to keep up"
 
 
+@pytest.mark.parametrize("lands", [False, True], ids=["left", "an operator lands it"])
+def test_a_vehicle_in_the_air_that_it_never_had_is_left_as_found_unless_an_operator_lands_it(
+    lands: bool,
+) -> None:
+    """An agent that was started again waits for a peer that does not come."""
+    flight = Flight()
+    flight.armed, flight.landed, flight.pos = True, IN_AIR, START.copy()
+    flight.peers = {}
+    if lands:
+        flight.run(10.0)
+        assert flight.ask("land") == ""
+    assert (Verb.LAND in flight.run(95.0)) is lands
+    assert flight.at == ("LAND" if lands else "DONE")
+
+
 def test_a_vehicle_left_in_offboard_is_put_on_hold_so_that_it_can_be_armed() -> None:
     flight = Flight()
     flight.flight_mode, flight.armable = FlightMode.EXTERNAL, False
