@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import operator
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -149,10 +150,15 @@ class Swarm:
             yaw_deg: heading there, clockwise from north; None for that of the mission.
             speed_m_s: peak speed; None for `agent.state_machine.speed_m_s`.
             far: fly there though it is more than 500 m away.
+
+        Raises:
+            ConfigError: it is no number of one agent, or the point is not three numbers.
         """
+        if isinstance(agent, Iterable) or agent is None:
+            raise ConfigError("goto", [f"agent = {agent!r}: expected the number of one agent, as 0"])
         if len(point_ned_m) != len(POINT):
             raise ConfigError("goto", [f"point_ned_m = {point_ned_m!r}: expected three numbers: {', '.join(POINT)}"])
-        asked = dict(zip(POINT, map(float, point_ned_m), strict=True))
+        asked = dict(zip(POINT, point_ned_m, strict=True))
         chosen = {YAW: yaw_deg, SPEED: speed_m_s, FAR: 1.0 if far else None}
         self.order(GOTO, agent, **asked, **{name: value for name, value in chosen.items() if value is not None})
 
@@ -180,14 +186,15 @@ class Swarm:
             arguments: those of the verb, by name with the unit.
 
         Raises:
-            ConfigError: there is no such verb or agent, or its arguments are others.
+            ConfigError: there is no such verb or agent, its arguments are others, or one of them is no number.
             StartError: the launch has ended.
             MissionError: an agent refuses it or is silent; says which and why.
         """
-        if problem := order_problem(verb, arguments):
+        numbers = _as_floats(verb, arguments)
+        if problem := order_problem(verb, numbers):
             raise ConfigError("order", [problem])
         self._refuse_ended(verb)
-        _refuse_problems(deliver(self._note(), Order(verb, arguments), _numbers(agents)))
+        _refuse_problems(deliver(self._note(), Order(verb, numbers), _numbers(agents)))
 
     def status(self) -> dict[int, dict[str, Any]]:
         """Return the newest status of every agent that answers, by agent; phase and modes are words.
@@ -286,6 +293,18 @@ def _numbers(agents: Agents) -> list[int]:
     if len(numbers) < len(named):
         raise ConfigError("agents", [f"{agents!r}: expected numbers of agents, as 0 or [0, 2]"])
     return numbers
+
+
+def _as_floats(verb: str, arguments: Mapping[str, object]) -> dict[str, float]:
+    """Return the arguments of an order as the bus carries them; numbers of numpy are numbers, too.
+
+    Raises:
+        ConfigError: one is no number; text and truth values are none.
+    """
+    wrong = {name: value for name, value in arguments.items() if not isinstance(value, Real) or isinstance(value, bool)}
+    if wrong:
+        raise ConfigError(verb, [f"{name} = {value!r}: expected a number" for name, value in wrong.items()])
+    return {name: float(value) for name, value in arguments.items() if isinstance(value, Real)}
 
 
 def _refuse_problems(replies: Sequence[Reply]) -> None:

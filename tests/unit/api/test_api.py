@@ -8,10 +8,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -21,9 +21,12 @@ import swarmctl
 from swarmctl.api import flight
 from swarmctl.api.flight import Swarm, _numbers
 from swarmctl.api.flight_process import FlightProcess
+from swarmctl.bus.messages.json_messages import CommandMessage, decode_command, encode_message
 from swarmctl.config import Config, dump, load
+from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
+from swarmctl.ops.orders.order_delivery import Reply
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
 from tests import builders
 from tests.unit.ops.test_cli import HEAVY
@@ -213,6 +216,54 @@ def test_phases_and_points_that_are_none_are_refused_in_words(tmp_path: Path) ->
         swarm.wait_for("track")
     with pytest.raises(ConfigError, match=r"point_ned_m = \(1, 2\): expected three numbers: north_m, east_m, down_m"):
         swarm.goto(0, (1, 2))
+
+
+@pytest.fixture
+def orders(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """Have orders of a swarm end up here, as they would be on the bus."""
+    sent: list[bytes] = []
+
+    def take(note: None, order: Order, agents: Sequence[int]) -> list[Reply]:
+        sent.append(encode_message(CommandMessage(order.verb, 0, 1, dict(order.arguments))))
+        return []
+
+    monkeypatch.setattr(Swarm, "_note", lambda _: None)
+    monkeypatch.setattr(flight, "deliver", take)
+    return sent
+
+
+def flying(tmp_path: Path) -> Swarm:
+    process: Any = SimpleNamespace(is_running=True)
+    return Swarm(load(None, ["swarm.agents=2"]), tmp_path, process)
+
+
+@pytest.mark.parametrize(
+    "number", [1, 1.0, np.float64(1.0), np.float32(1.0), np.int64(1)], ids=lambda n: type(n).__name__
+)
+def test_orders_take_numbers_of_numpy(number: Any, orders: list[bytes], tmp_path: Path) -> None:
+    swarm, point = flying(tmp_path), cast(Any, np.array([1.0, 2.0, -3.0]))
+    swarm.goto(cast(Any, np.int64(1)), point, yaw_deg=number, speed_m_s=number)
+    swarm.order("goto", 0, north_m=number, east_m=number, down_m=number)
+    for message in orders:
+        assert decode_command(message) is not None
+    assert len(orders) == 2
+
+
+@pytest.mark.parametrize("wrong", [True, np.bool_(True), "90", b"90", [90.0], np.array([90.0])], ids=repr)
+def test_an_order_with_something_else_than_a_number_is_refused(wrong: Any, orders: list[bytes], tmp_path: Path) -> None:
+    swarm = flying(tmp_path)
+    with pytest.raises(ConfigError, match=r"yaw_deg = .*: expected a number"):
+        swarm.goto(0, (1.0, 2.0, -3.0), yaw_deg=wrong)
+    with pytest.raises(ConfigError, match=r"down_m = .*: expected a number"):
+        swarm.goto(0, (1.0, 2.0, wrong))
+    assert orders == []
+
+
+@pytest.mark.parametrize("nobody", [None, [0, 1], [0], (), "0", 0.5, True], ids=repr)
+def test_one_agent_alone_is_sent_to_a_point(nobody: Any, orders: list[bytes], tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="expected"):
+        flying(tmp_path).goto(nobody, (1.0, 2.0, -3.0))
+    assert orders == []
 
 
 def test_who_has_landed_and_ended_has_reached_every_phase(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
