@@ -16,7 +16,7 @@ from swarmctl.control.reference.quintic import out_and_back, quintic_to, to_targ
 from swarmctl.core.types import Array, VehicleState
 
 _POINTS = 60  # of a way whose speed and acceleration are checked
-_LONGER, _MOST_LONGER = 1.25, 10  # factor of a travel time that is too short, and how often
+_LONGER, _MOST_LONGER = 1.15, 16  # factor of a travel time that is too short, and how often
 _TURNS_ROUND = 1.6  # peak acceleration of a quintic whose first velocity leads elsewhere, over the one asked for
 
 
@@ -62,10 +62,11 @@ class WayBack:
         bend = 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
         away = pos_ned_m - self.from_ned_m
         vel = share * vel_ned_m_s + slope * away / self.travel_s
-        accel = bend * away / self.travel_s**2 + 2.0 * slope * vel_ned_m_s / self.travel_s
-        fastest_m_s = _longest(vel_ned_m_s)
+        its_own_m_s2 = np.gradient(vel_ned_m_s, self.travel_s / (len(s) - 1), axis=0)
+        joining_m_s2 = bend * away / self.travel_s**2 + 2.0 * slope * vel_ned_m_s / self.travel_s
+        fastest_m_s, most_m_s2 = _longest(vel_ned_m_s), _TURNS_ROUND * accel_m_s2 + _longest(its_own_m_s2)
         slow = _longest(vel) <= fastest_m_s + max(speed_m_s, fastest_m_s)
-        return slow and _longest(accel) <= _TURNS_ROUND * accel_m_s2
+        return slow and _longest(joining_m_s2 + share * its_own_m_s2) <= most_m_s2
 
 
 def way_back(
