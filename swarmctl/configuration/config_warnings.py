@@ -13,6 +13,7 @@ from swarmctl.configuration.constraints import is_tick
 from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.control.reference.kinds.csv_table import CsvParams
 from swarmctl.control.reference.mission import MissionReference
+from swarmctl.core.goal import REACHED_M
 from swarmctl.core.text import point_text
 from swarmctl.core.types import Array
 from swarmctl.telemetry.evaluation.referee import Rules
@@ -32,7 +33,11 @@ def config_warnings(config: Config) -> list[str]:
     kind = config.mission.kind
     found = [f"mission.{name} is set, mission.kind is {kind!r}: it is not flown" for name in unused]
     references = config.mission.references(np.array(config.starts_ned_m()), config.separation.budget.planned_m)
-    flown = [text for about in (_begin_elsewhere, _left_behind, _seen_too_late) for text in about(config, references)]
+    flown = [
+        text
+        for about in (_begin_elsewhere, _cut_short, _same_goals, _left_behind, _seen_too_late)
+        for text in about(config, references)
+    ]
     judged = (*_judged_by_more_than_is_kept(config), *_stand_above_each_other(config))
     return [*found, *flown, *judged, *_turned_by_steep_tilt(config), *_counts_by_other_ticks(config)]
 
@@ -74,6 +79,33 @@ def _begin_elsewhere(config: Config, references: Sequence[MissionReference]) -> 
     added = config.mission.kind == "csv" and config.mission.section(CsvParams).from_start
     hint = "; mission.csv.from_start adds positions to the start: begin at 0, 0, 0" if added else ""
     yield from _first([f"{text}{hint}" for text in found], "references begin away from the agents' starts")
+
+
+def _cut_short(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
+    """Yield which references end, away from where they are then, after the mission: the rest is not flown."""
+    found, duration_s = [], config.mission.duration_s
+    for agent, reference in enumerate(references):
+        ends_s = duration_s if reference.ends_s is None else reference.ends_s
+        now, end = reference.sample(np.array([duration_s, ends_s]))[0]
+        left_m = float(np.linalg.norm(end - now))
+        if ends_s > duration_s and left_m > REACHED_M:
+            left = f"{left_m:.1f} m from where it ends, after {ends_s:.1f} s"
+            found.append(f"mission.duration_s = {duration_s:g}: the reference of agent {agent} is then {left}")
+    yield from _first(found, "references are cut short")
+
+
+def _same_goals(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
+    """Yield which agents are meant to arrive nearer to each other than plans keep, so that not all of them can."""
+    found, apart_m = [], config.separation.radius_m
+    goals = [(agent, reference.goal) for agent, reference in enumerate(references)]
+    for (i, a), (j, b) in itertools.combinations(goals, 2):
+        if a is None or b is None:
+            continue
+        away = a.pos_ned_m - b.pos_ned_m
+        away_m = float(np.linalg.norm(away / [1.0, 1.0, config.separation.downwash]))
+        if away_m < apart_m - _SAME_M:
+            found.append(f"the goals of agents {i} and {j} are {away_m:.2f} m apart; separation.radius_m = {apart_m:g}")
+    yield from _first([f"{text}: not both arrive" for text in found], "pairs of goals are as near")
 
 
 def _left_behind(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:

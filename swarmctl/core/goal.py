@@ -14,4 +14,4 @@ class Goal:
     """Holds where a reference comes to rest for good."""
 
     pos_ned_m: Array  # (3,)
-    needs_s: float = 0.0  # mission time that the allowed speed and acceleration need; 0 where times are given
+    needs_s: float = 0.0  # least mission time; 0 of a mission that may end on the way, which is warned of

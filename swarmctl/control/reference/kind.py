@@ -67,6 +67,10 @@ class MissionKind(Params):
         """Return where one agent is meant to arrive; None for a kind that is flown for its way."""
         return None
 
+    def ends_s(self, place: Place) -> float | None:
+        """Return the mission time from which the reference of one agent rests; None for a kind that never does."""
+        return None
+
     def problems(self, agents: int) -> Iterator[str]:
         """Yield problems that involve several keys, if this kind is flown."""
         yield from ()

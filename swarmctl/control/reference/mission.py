@@ -184,6 +184,7 @@ class MissionReference:
         jumps: positions are steps, which no vehicle follows.
         fixed_in_time: every agent is meant to be where its reference is.
         goal: where the agent is meant to arrive; None of a mission that is flown for its way, or somebody else's.
+        ends_s: mission time from which it rests; None of a mission that never does, or somebody else's.
     """
 
     def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int, apart_m: float = 0.0) -> None:
@@ -191,6 +192,7 @@ class MissionReference:
         self._own_name = params.kind if params.is_own else ""
         place = Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m)
         self.goal = None if params.is_own else self._mission.goal(place)
+        self.ends_s = None if params.is_own else self._mission.ends_s(place)
         asked = _tabulated(self._mission, place, params) if params.is_own else _flown(self._mission, place)
         self._sampled, self._heading, self.offset_ned_m = asked.sampled, asked.heading, asked.offset_ned_m
         self.jumps, self.fixed_in_time = asked.jumps, asked.fixed_in_time

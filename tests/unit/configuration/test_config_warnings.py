@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import warnings
+import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +52,62 @@ def test_commitments_that_keep_less_from_an_obstacle_than_the_flight_is_judged_b
     (said,) = lines(*keeps, narrow, "limits.obstacle_margin_m=0.1")
     assert said.endswith("commitments keep 0.95 m, and the flight fails below 1.00 m; 1.1 m keeps that")
     assert lines(*keeps, narrow.replace("1.05", "1.1"), "limits.obstacle_margin_m=0.1") == []
+
+
+ALONE = ("swarm.agents=1", "start.positions_ned_m=[[0,0,-2]]")
+FAR_POINTS = ("mission.kind=waypoints", "mission.waypoints.lists=[{points_ned_m=[[0,0,-2],[80,0,-2]]}]")
+
+
+def table(folder: Path) -> tuple[str, ...]:
+    path = folder / "long.csv"
+    path.write_text("t,x,y,z\n0,0,0,-2\n60,30,0,-2\n")
+    return ("mission.kind=csv", f"mission.csv.files=['{path}']")
+
+
+def show(folder: Path) -> tuple[str, ...]:
+    points = [[0, [0, 0, 2], []], [60, [30, 0, 2], []]]
+    drone = {"settings": {"trajectory": {"version": 1, "takeoffTime": 0, "points": points}}}
+    with zipfile.ZipFile(folder / "show.skyc", "w") as archive:
+        archive.writestr("show.json", json.dumps({"version": 1, "swarm": {"drones": [{"type": "generic", **drone}]}}))
+    return ("mission.kind=skybrush", f"mission.skybrush.file='{folder / 'show.skyc'}'")
+
+
+@pytest.mark.parametrize(
+    ("mission", "enough_s"),
+    [(lambda _: FAR_POINTS, 200), (table, 60), (show, 60)],
+    ids=["waypoints", "csv", "skybrush"],
+)
+def test_a_mission_that_ends_before_its_reference_does_is_named(
+    mission: Callable[[Path], tuple[str, ...]], enough_s: int, tmp_path: Path
+) -> None:
+    flown = (*ALONE, *mission(tmp_path))
+    (said,) = lines(*flown, "mission.duration_s=30")
+    assert said.startswith("mission.duration_s = 30: the reference of agent 0 is then ")
+    assert " m from where it ends, after " in said
+    assert lines(*flown, f"mission.duration_s={enough_s}") == []
+
+
+def test_a_swap_that_is_cut_short_is_named() -> None:
+    swap = ("swarm.agents=2", "start.spacing_m=4", "mission.kind=swap", "mission.swap.travel_s=20")
+    assert len(lines(*swap, "mission.duration_s=10")) == 2
+    assert lines(*swap, "mission.duration_s=20") == []
+
+
+@pytest.mark.parametrize(
+    ("mission", "at_m"),
+    [
+        ("mission.waypoints.lists=[{points_ned_m=[[0,-3,-2],GOAL]},{points_ned_m=[[0,3,-2],[10,0,-2]]}]", 0.0),
+        ("mission.goto={goal_assignment=false,goals_ned_m=[GOAL,[10,0,-2]]}", 0.1),
+        ("mission.goto={goal_assignment=false,goals_ned_m=[GOAL,[10,0,-2]]}", 1.0),
+    ],
+    ids=["waypoints", "goto", "apart"],
+)
+def test_goals_that_two_agents_can_not_both_be_at_are_named(mission: str, at_m: float) -> None:
+    kind = mission.split(".")[1].partition("=")[0]
+    two = ("swarm.agents=2", "start.positions_ned_m=[[0,-3,-2],[0,3,-2]]", f"mission.kind={kind}")
+    found = lines(*two, mission.replace("GOAL", f"[10,{at_m},-2]"))
+    near = f"the goals of agents 0 and 1 are {at_m:.2f} m apart; separation.radius_m = 0.9: not both arrive"
+    assert found == ([near] if at_m < 0.9 else [])
 
 
 def test_starts_that_only_heights_keep_apart_are_named() -> None:

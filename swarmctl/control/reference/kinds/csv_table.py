@@ -74,6 +74,9 @@ class CsvParams(SharedReference):
             return None
         return lambda t_s: sign * flight.sample(t_s)[0][:, 3] + offset_rad
 
+    def ends_s(self, place: Place) -> float:
+        return float(self._flight(place).knots_s[-1])
+
     def problems(self, agents: int) -> Iterator[str]:
         if len(self.tables) not in (1, agents):
             count = f"{len(self.tables)} files for swarm.agents = {agents}"

@@ -51,6 +51,9 @@ class SkybrushParams(MissionKind):
 
         return sampled
 
+    def ends_s(self, place: Place) -> float:
+        return float(_flight(self.trajectories[place.agent]).knots_s[-1]) - self.begin_s
+
     def problems(self, agents: int) -> Iterator[str]:
         if not self.file and not self.trajectories:
             yield "mission.skybrush.file: missing; name a .skyc file"

@@ -30,6 +30,9 @@ class SwapParams(MissionKind):
     def goal(self, place: Place) -> Goal | None:
         return Goal(pos_ned_m=self._flight(place).to_ned_m)
 
+    def ends_s(self, place: Place) -> float:
+        return self.travel_s
+
     def problems(self, agents: int) -> Iterator[str]:
         if agents < 2:
             yield f"mission.kind = 'swap' with swarm.agents = {agents}: a swap needs at least 2"

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from swarmctl.control.reference.kind import Place, SharedReference, mission_kind
 from swarmctl.control.reference.minimum_snap import fastest_minimum_snap, minimum_snap
+from swarmctl.control.reference.polynomial import PiecewisePolynomial
 from swarmctl.core.goal import Goal
 from swarmctl.core.params import Params, Vec3
 from swarmctl.core.types import Sampled
@@ -38,17 +39,16 @@ class WaypointsParams(SharedReference):
         return len(self.lists) > 1 and all(own.times_s for own in self.lists)
 
     def reference(self, place: Place) -> Sampled:
-        own = self._list(place)
-        points = np.array(own.points_ned_m)
-        if own.times_s:
-            return minimum_snap(np.array(own.times_s), points).sample
-        return fastest_minimum_snap(points, self.speed_m_s, self.accel_m_s2).sample
+        return self._flight(place).sample
 
     def goal(self, place: Place) -> Goal | None:
         """Return the agent's last point; agents that share their points can't all be there."""
         if len(self.lists) < len(place.starts_ned_m):
             return None
         return Goal(pos_ned_m=np.array(self._list(place).points_ned_m[-1]))
+
+    def ends_s(self, place: Place) -> float:
+        return float(self._flight(place).knots_s[-1])
 
     def problems(self, agents: int) -> Iterator[str]:
         if len(self.lists) not in (1, agents):
@@ -60,6 +60,13 @@ class WaypointsParams(SharedReference):
             yield "mission.waypoints.goal_assignment = true: is for lists that agents share; set it to false"
         for i, own in enumerate(self.lists):
             yield from (f"mission.waypoints.lists.{i}.{problem}" for problem in _problems(own))
+
+    def _flight(self, place: Place) -> PiecewisePolynomial:
+        own = self._list(place)
+        points = np.array(own.points_ned_m)
+        if own.times_s:
+            return minimum_snap(np.array(own.times_s), points)
+        return fastest_minimum_snap(points, self.speed_m_s, self.accel_m_s2)
 
     def _list(self, place: Place) -> WaypointsList:
         return self.lists[place.agent if len(self.lists) > 1 else 0]
