@@ -63,3 +63,10 @@ def test_eight_swap_places_at_6_m_s() -> None:
     ticks = [log.ticks[log.ticks["phase"] == Phase.TRACK] for log in flight.lockstep.logs]
     fastest_m_s = [np.linalg.norm(rows["vel_ned_m_s"], axis=1).max() for rows in ticks]
     assert min(fastest_m_s) > 5.5
+
+
+def test_the_way_home_from_a_fast_circle_swings_out_no_farther_than_braking_takes(fly: Fly) -> None:
+    """By the acceleration of transits alone it led 21 m beyond the circle of 5 m."""
+    flight = fly("mission.duration_s=6", "sitl.start=air", config="x500_fast_circle.toml")
+    after = flight.t_s > float(flight.tracked(0)[0]["t_us"][-1]) * 1e-6
+    assert np.abs(flight.pos_ned_m[after, 0, :2]).max() < 16.0

@@ -163,7 +163,7 @@ def test_a_hold_on_the_way_down_stops_above_the_ground() -> None:
     points = "mission.waypoints.lists=[{points_ned_m=[[0,0,-12],[20,0,-1.5]]}]"
     sinks = ("mission.kind=waypoints", points, "mission.waypoints.speed_m_s=4", "mission.waypoints.accel_m_s2=3")
     starts = ("swarm.agents=1", "start.positions_ned_m=[[0,0,-12]]", "sitl.ground_z_m=0", "mission.duration_s=20")
-    flight = Lockstep(load(None, (*COARSE, *starts, *sinks)))
+    flight = Lockstep(load(None, (*COARSE, *starts, *sinks, "agent.state_machine.speed_m_s=5")))
     fly_until(flight, lambda: phase(flight) is Phase.TRACK and vehicle(flight)[0][2] > -4.0)
     begun_us = flight.clock.now_us()
     flight.command("hold", 0)

@@ -18,7 +18,8 @@ _WAY_POINTS = 300  # of a way that is checked
 _LEAST_HEIGHT_M = 0.5  # above the ground, to which a vehicle may be carried as it stops or turns round
 _HARDER = 8  # decelerations that are tried, from that of transits up, until one keeps above the ground
 _LOW_POINTS = 60  # of a way whose lowest point is looked for
-_OF_SHEDDING = 1.15  # most deceleration at which a velocity is shed, over `brake_m_s2`: the peak of a stop at once
+# most deceleration over `brake_m_s2`: 3/4 of it is the peak of a stop, 1.31 that of shedding a velocity
+_OF_STOPS, _OF_SHEDDING = 2.0, 1.15
 
 W = TypeVar("W")
 
@@ -106,11 +107,11 @@ class Trajectories:
 
     def stop(self, now_us: int, state: VehicleState, *, at_once: bool = False) -> None:
         """Begin to brake to rest, smoothly or at once; harder where a vehicle that sinks would come near the ground."""
-        pos, vel, most_m_s2 = state.pos_ned_m, state.vel_ned_m_s, max(self._accel_m_s2, 2.0 * self._brake_m_s2)
-        least_m_s2 = most_m_s2 if at_once else self._accel_m_s2
+        pos, vel = state.pos_ned_m, state.vel_ned_m_s
+        least_m_s2, most_m_s2 = self._decelerations_m_s2(vel, _OF_STOPS)
         braked = self._above_ground(
             state,
-            (least_m_s2, most_m_s2),
+            (most_m_s2 if at_once else least_m_s2, most_m_s2),
             lambda accel_m_s2: brake_to_rest(pos, vel, accel_m_s2),
             lambda found: float(found.to_ned_m[2]),
         )
@@ -130,7 +131,8 @@ class Trajectories:
         def lowest_m(found: QuinticTrajectory) -> float:
             return float(found.sample(np.linspace(0.0, found.travel_s, _LOW_POINTS))[0][:, 2].max())
 
-        self._begin(self._above_ground(state, self._sheds_m_s2, shed, lowest_m, float(target_ned_m[2])), now_us)
+        between_m_s2 = self._decelerations_m_s2(vel, _OF_SHEDDING)
+        self._begin(self._above_ground(state, between_m_s2, shed, lowest_m, float(target_ned_m[2])), now_us)
 
     def is_left(self, now_us: int, state: VehicleState, away_m: float) -> bool:
         """Return whether the present trajectory is over and the vehicle farther than that from its end."""
@@ -167,12 +169,22 @@ class Trajectories:
             lowest_m = float(found.sample(t_s, pos, vel)[0][:, 2].max())
             return -math.inf if lowest_m <= pos[:, 2].max() else lowest_m
 
-        return self._above_ground(state, self._sheds_m_s2, shed, below_mission_m)
+        return self._above_ground(
+            state, self._decelerations_m_s2(state.vel_ned_m_s, _OF_SHEDDING), shed, below_mission_m
+        )
 
-    @property
-    def _sheds_m_s2(self) -> tuple[float, float]:
-        """Return the least and the most deceleration at which a first velocity is shed."""
-        return self._accel_m_s2, max(self._accel_m_s2, _OF_SHEDDING * self._brake_m_s2)
+    def _decelerations_m_s2(self, vel_ned_m_s: Array, of_brake: float) -> tuple[float, float]:
+        """Return the least and the most deceleration at which a first velocity (3,) is shed, or braked to rest.
+
+        The least is that of transits; what is faster than they are is lost as fast as peers expect. A mission at
+        7.5 m/s would else lead 40 m beyond its end.
+        """
+        hard_m_s2 = max(self._accel_m_s2, of_brake * self._brake_m_s2)
+        speed_m_s = math.sqrt(float(vel_ned_m_s @ vel_ned_m_s))
+        fast_m_s = speed_m_s - self._speed_m_s
+        if fast_m_s <= 0.0:
+            return self._accel_m_s2, hard_m_s2
+        return speed_m_s / (self._speed_m_s / self._accel_m_s2 + fast_m_s / hard_m_s2), hard_m_s2
 
     def _lowest_m(self, state: VehicleState) -> float:
         """Return the down coordinate to which a vehicle may be carried; one that is lower already, where it is."""

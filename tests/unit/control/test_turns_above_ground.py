@@ -14,7 +14,7 @@ from tests import builders
 
 HOME = np.array([0.0, 0.0, -12.0])
 LEAST_M = 0.5
-ACCEL_M_S2, BRAKE_M_S2 = 1.2, 3.0
+SPEED_M_S, ACCEL_M_S2, BRAKE_M_S2 = 4.5, 1.2, 3.0
 
 
 def sinking(speed_m_s: float, accel_m_s2: float, ahead_m: float = 20.0) -> MissionReference:
@@ -25,7 +25,7 @@ def sinking(speed_m_s: float, accel_m_s2: float, ahead_m: float = 20.0) -> Missi
 
 
 def trajectories(mission: MissionReference, ground_z_m: float | None = 0.0) -> Trajectories:
-    limits = {"speed_m_s": 2.0, "accel_m_s2": ACCEL_M_S2, "brake_m_s2": BRAKE_M_S2}
+    limits = {"speed_m_s": SPEED_M_S, "accel_m_s2": ACCEL_M_S2, "brake_m_s2": BRAKE_M_S2}
     made = Trajectories(mission, HOME, **limits)
     made.ground_z_m = ground_z_m
     return made
@@ -79,6 +79,29 @@ def test_a_stop_that_has_room_is_as_gentle_as_without_a_ground() -> None:
     assert with_ground.current is not None
     assert without.current is not None
     assert with_ground.current.trajectory.travel_s == without.current.trajectory.travel_s
+
+
+def farthest_m(way: Callable[[Trajectories, VehicleState], object], speed_m_s: float) -> float:
+    """Return how far from where it begins a way leads that begins so fast, to the east."""
+    flown = trajectories(sinking(2.0, 2.0), ground_z_m=None)
+    way(flown, builders.vehicle_state(pos_ned_m=HOME, vel_ned_m_s=np.array([0.0, speed_m_s, 0.0])))
+    return float(flown.reference(0, np.linspace(0.0, 60.0, 2000))[0][:, 1].max())
+
+
+@pytest.mark.parametrize(
+    ("way", "transit_m", "fast_m"),
+    [
+        (lambda flown, state: flown.stop(0, state), 16.9, 41.0),
+        (lambda flown, state: flown.go_to(HOME, 0, state), 10.0, 28.0),
+    ],
+    ids=["stop", "home"],
+)
+def test_a_velocity_beyond_that_of_transits_is_lost_as_fast_as_peers_expect(
+    way: Callable[[Trajectories, VehicleState], object], transit_m: float, fast_m: float
+) -> None:
+    """By the acceleration of transits alone, a stop at 9 m/s took 68 m, and the way home led 40 m ahead."""
+    assert farthest_m(way, SPEED_M_S) == pytest.approx(transit_m, rel=0.02)
+    assert farthest_m(way, 2.0 * SPEED_M_S) < fast_m
 
 
 def go_home(flown: Trajectories, state: VehicleState) -> Array:
