@@ -102,6 +102,7 @@ def _setup_of(config: Config, agent: int, boot_id: int, originals: Mapping[str, 
         volume=config.volume.flight_volume(),
         fence=config.geofence.area(),
         drift_m=config.drift_m,
+        has_ground=not config.sitl.enabled or config.sitl.start == "ground",
         originals=originals,
     )
 

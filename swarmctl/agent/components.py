@@ -248,5 +248,6 @@ def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
         reference=reference,
         contains=lambda at_ne_m: setup.fence is None or setup.fence.contains(at_ne_m),
         volume=setup.volume,
+        has_ground=setup.has_ground,
     )
     return MissionStateMachine(setup.params.state_machine, mission)

@@ -66,6 +66,7 @@ class AgentSetup:
     volume: FlightVolume | None  # to stay in
     fence: Geofence | None  # in which autopilots keep their vehicles; None: no fence
     drift_m: float  # by a gust of `separation.gust_m_s`
+    has_ground: bool  # to land on: a simulator that begins in the air has none
     originals: Mapping[str, int | float]  # of parameters that an ended agent has changed, whose vehicle this one lands
 
     @property

@@ -50,6 +50,7 @@ class MissionSetup:
     reference: MissionReference  # of the tracked mission
     contains: Contains = lambda _: True  # whether a place lies within the geofence
     volume: FlightVolume | None = None  # to stay in
+    has_ground: bool = True  # to land on
 
 
 class MissionState:
@@ -77,6 +78,7 @@ class MissionState:
         resumed_us: monotonic time of that resume, or of one that has ended a hold since.
         setpoints_stopped: the override has followed from that.
         airborne: the vehicle was found in the air at start-up.
+        must_land: something has ended the mission, or an operator, also after it was completed.
         landing_seen: the autopilot lands, or has.
         outcome_before: outcome before the override, restored by resume.
         patient_from_us: monotonic time from which the patience with the start counts.
@@ -99,7 +101,8 @@ class MissionState:
         self.requested_us = -REQUEST_PERIOD_US
         self.offered: OfferedMission | None = None
         self.keeps_up = self.had_control = self.pilot_override = self.may_take_control = False
-        self.setpoints_stopped = self.airborne = self.landing_seen = False
+        self.setpoints_stopped = self.airborne = self.landing_seen = self.must_land = False
+        self._has_ground = setup.has_ground
         self.arming, self.climb = ArmingEvidence(), Climb(setup.start_ned_m)
         self.trajectories = Trajectories(
             setup.reference,
@@ -134,6 +137,15 @@ class MissionState:
     def ground_z_m(self) -> float | None:
         """Return the down coordinate of the place that the vehicle takes off from; None where that is not known."""
         return None if self.airborne or self.phase < Phase.ARM else self.climb.ground_z_m
+
+    @property
+    def handed_back(self) -> bool:
+        """Return whether a vehicle that was found in the air is handed back there: after a completed mission alone.
+
+        What else ends the mission wants it on the ground: an operator's stop, a low battery.
+        """
+        completed = self.outcome == COMPLETED and not self.must_land
+        return self.airborne and (completed or not self._has_ground)
 
     @property
     def leads_below_ground(self) -> str:
@@ -274,7 +286,7 @@ class MissionState:
 
         A vehicle that was found in the air and has not been asked for anything yet is left as it was found.
         """
-        self.outcome = self.outcome or why
+        self.outcome, self.must_land = self.outcome or why, True
         if self.phase < Phase.ARM and not self.arming.requested:
             self.enter(Phase.DONE, inputs.now_us)
             return
@@ -304,7 +316,7 @@ class MissionState:
 
     def fly_back(self, why: str, now_us: int, state: VehicleState) -> None:
         """Fly to the landing place because something ends the mission."""
-        self.outcome = self.outcome or f"{why}{_FLIES_BACK}"
+        self.outcome, self.must_land = self.outcome or f"{why}{_FLIES_BACK}", True
         self.go_home(now_us, state)
 
     def end_way_back(self, words: str) -> None:

@@ -31,7 +31,7 @@ def apply_stop(mission: MissionState, now_us: int, state: VehicleState, is_over:
     verb, mission.stop_verb = mission.stop_verb, ""
     if not verb or mission.phase >= Phase.LAND:
         return
-    mission.outcome = mission.outcome or OPERATOR_STOP
+    mission.outcome, mission.must_land = mission.outcome or OPERATOR_STOP, True
     if mission.climbs(state) and not mission.pilot_override and is_over():
         mission.abandon_climb(now_us)
     elif mission.phase < Phase.GOTO_START or mission.pilot_override:

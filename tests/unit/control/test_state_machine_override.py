@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
+from swarmctl.control.failsafe.decision import Escalation, Response
 from swarmctl.control.phases.mission_state import TAKEN_OVER
 from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.control.phases.state_machine import REBOOTED
@@ -292,6 +295,50 @@ def test_a_vehicle_found_in_the_air_is_handed_back_in_the_air(landed_at_first: L
     np.testing.assert_allclose(pos[0], flight.pos, atol=1e-9)  # where the mission ends, not where it began
     assert (flight.phase, flight.mission.outcome) == (Phase.DONE, "completed")
     assert flight.armed
+
+
+def stops_asked(flight: Flight) -> set[Verb]:
+    """Return what of landing and holding is asked until the agent is done, or for a minute."""
+    asked: set[Verb] = set()
+    for _ in range(600):
+        commands = flight.step()
+        asked |= set(verbs(commands)) & {Verb.LAND, Verb.HOLD}
+        flight._obey(commands)
+        if Verb.HOLD in verbs(commands):
+            flight.flight_mode = FlightMode.HOLD
+        if flight.phase is Phase.DONE:
+            break
+    return asked
+
+
+@pytest.mark.parametrize("why", ["land", "rtl", "battery"])
+def test_a_vehicle_found_in_the_air_is_landed_by_what_ends_its_mission(why: str) -> None:
+    """It hovered with no agent until its battery was empty."""
+    flight = airborne().until(Phase.TRACK)
+    if why == "battery":
+        flight.failsafe_mode, flight.escalation = Mode.TRACKING, Escalation(Response.LAND, "battery at 6 %")
+    else:
+        assert flight.ask(why) == ""
+    assert stops_asked(flight) == {Verb.LAND}
+    assert (flight.at, flight.armed) == ("DONE", False)
+
+
+def test_a_vehicle_found_in_the_air_is_landed_by_an_operator_also_after_its_mission() -> None:
+    flight = airborne().until(Phase.GOTO_LAND)
+    assert flight.mission.outcome == "completed"
+    assert flight.ask("land") == ""
+    assert stops_asked(flight) == {Verb.LAND}
+
+
+def test_where_there_is_no_ground_a_vehicle_is_handed_back_whatever_ends_its_mission() -> None:
+    (agent,) = Lockstep(load(None, ["swarm.agents=1", "sitl.start=air"])).agents
+    (standing,) = Lockstep(load(None, ["swarm.agents=1"])).agents
+    assert agent is not None
+    assert standing is not None
+    for mission in (agent._mission, standing._mission):
+        mission.airborne, mission.outcome = True, OPERATOR_STOP
+    assert agent._mission.handed_back
+    assert not standing._mission.handed_back
 
 
 def test_a_vehicle_found_in_the_air_is_not_flown_into_a_mission_that_has_begun() -> None:

@@ -1,6 +1,6 @@
 """GOTO_LAND and LAND: the agent flies to where it may land, then its autopilot lands it. Pure.
 
-A vehicle found in the air at start-up is handed back in the air, in the autopilot's hold.
+A vehicle found in the air at start-up is handed back in the air after a completed mission, in the autopilot's hold.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _is_crossed(mission: MissionState, inputs: PhaseInputs, state: VehicleState)
 def land(mission: MissionState, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
     """Have the autopilot land, and disarm, or give the vehicle back in the air."""
     mission.had_control = False
-    if mission.airborne:  # found in the air, handed back in the air
+    if mission.handed_back:
         if state.mode is not FlightMode.EXTERNAL:
             mission.enter(Phase.DONE, inputs.now_us)
             return []
