@@ -178,7 +178,7 @@ def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:
     params, model = setup.params, setup.vehicle_model
     if params.state_filter.enabled:
         return StateFilter(params.state_filter, params.disturbance, model)
-    return DisturbanceObserver(params.disturbance, model.hover_thrust_01)
+    return DisturbanceObserver(params.disturbance, model.hover_thrust_01, model.drag_1_s)
 
 
 def make_safety_filter(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> SafetyFilter:

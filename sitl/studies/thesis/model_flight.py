@@ -62,7 +62,7 @@ class Pilot:
         self._dt_us, self._steps = self._controller.dt_us, self._controller.steps
         self._predictor = Predictor(config.vehicle_model)
         hover_01 = PRESETS["thesis"].mass_kg * GRAVITY_M_S2 / PRESETS["thesis"].thrust_max_n
-        self._observer = DisturbanceObserver(config.agent.disturbance, hover_01)
+        self._observer = DisturbanceObserver(config.agent.disturbance, hover_01, config.vehicle_model.drag_1_s)
         starts = np.array(config.starts_ned_m())
         self._reference = MissionReference(config.mission, starts, agent, config.separation.budget.planned_m)
         self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])

@@ -1,12 +1,14 @@
 """Estimates of the hover thrust and of a constant disturbance acceleration, for offset-free tracking.
 
 The observer compares the measured velocity with the one predicted from the *measured* attitude and the sent thrust, so
-that attitude lag is not taken for wind. The vertical disturbance is slowly moved into the hover thrust: a wrong mass or
-thrust scale then causes no altitude error, and horizontal gains (thrust over mass) become right as well.
+that attitude lag is not taken for wind. Drag is that of the model, as everybody who uses the estimate has it, too. The
+vertical disturbance is slowly moved into the hover thrust: a wrong mass or thrust scale then causes no altitude error,
+and horizontal gains (thrust over mass) become right as well.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,14 +77,20 @@ class HoverThrust:
 class DisturbanceObserver:
     """Second-order observer of the disturbance on each velocity axis, with an integrating hover-thrust estimate.
 
-    v' = a_model + d + l1 (v - v_hat), d' = l2 (v - v_hat) with both poles at `bandwidth_rad_s`.
+    v_hat' = a_model + d - drag v_hat + l1 (v - v_hat), d' = l2 (v - v_hat), without drag with both poles at
+    `bandwidth_rad_s`.
+
+    Args:
+        params: bandwidths and limits.
+        hover_thrust_01: first guess of the hover thrust.
+        drag_1_s: linear drag over mass in still air, which is no disturbance.
 
     Attributes:
         estimate: newest.
     """
 
-    def __init__(self, params: DisturbanceParams, hover_thrust_01: float) -> None:
-        self._params = params
+    def __init__(self, params: DisturbanceParams, hover_thrust_01: float, drag_1_s: float = 0.0) -> None:
+        self._params, self._drag_1_s = params, drag_1_s
         self._hover = HoverThrust(hover_thrust_01, params.hover_time_s)
         self._disturbance = [0.0, 0.0, 0.0]
         self._velocity: list[float] | None = None
@@ -109,9 +117,13 @@ class DisturbanceObserver:
         model = (-specific_m_s2 * north, -specific_m_s2 * east, -specific_m_s2 * down + GRAVITY_M_S2)
         pole, limit_m_s2 = self._params.bandwidth_rad_s, self._params.limit_m_s2
         taken_01, learned_1_s = min(1.0, 2.0 * pole * dt_s), dt_s * pole * pole
+        kept_01, gained_s = 1.0, dt_s
+        if self._drag_1_s:
+            kept_01 = math.exp(-self._drag_1_s * dt_s)
+            gained_s = (1.0 - kept_01) / self._drag_1_s
         velocity, disturbance = [0.0] * 3, [0.0] * 3
         for i, (measured, accel) in enumerate(zip(state.vel_ned_m_s.tolist(), model, strict=True)):
-            predicted = before[i] + dt_s * (accel + self._disturbance[i])
+            predicted = kept_01 * before[i] + gained_s * (accel + self._disturbance[i])
             innovation = measured - predicted
             velocity[i] = predicted + taken_01 * innovation
             disturbance[i] = min(max(self._disturbance[i] + learned_1_s * innovation, -limit_m_s2), limit_m_s2)

@@ -83,6 +83,16 @@ def test_a_vehicle_that_leans_and_does_not_move_stands_against_a_wind() -> None:
     np.testing.assert_allclose(observer.estimate.disturbance_ned_m_s2[:2], [-G * math.tan(0.2), 0.0], atol=0.02)
 
 
+@pytest.mark.parametrize(("wind_m_s", "expected_m_s2"), [(0.0, 0.0), (-3.0, -3.0)])
+def test_drag_in_still_air_is_no_disturbance_and_the_winds_is(wind_m_s: float, expected_m_s2: float) -> None:
+    lean, speed_m_s = math.atan((4.0 - wind_m_s) / G), 4.0  # with a drag of 1 1/s
+    observer = DisturbanceObserver(DisturbanceParams(), 0.5, 1.0)
+    for k in range(300):
+        held = quat_from_euler(0.0, -lean, 0.0)
+        observer.update(sample(k * DT_US, np.array([speed_m_s, 0.0, 0.0]), held), 0.5 / math.cos(lean))
+    np.testing.assert_allclose(observer.estimate.disturbance_ned_m_s2, [expected_m_s2, 0.0, 0.0], atol=0.01)
+
+
 def test_estimates_are_limited() -> None:
     observer = DisturbanceObserver(DisturbanceParams(limit_m_s2=1.0), 0.5)
     observe(observer, 20.0, np.array([6.0, -6.0, 9.0]), 0.5)
