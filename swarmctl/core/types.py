@@ -252,6 +252,7 @@ class Health:
     autopilot_failsafe: bool
     plan_status: PlanStatus
     last_good_plan_age_us: int  # of the newest certified plan that is still safe
+    last_good_plan_lasts_us: int  # from its begin to its end, after which it has no input
     planless_us: int  # time since a plan was last certified
     speed_m_s: float
     phase: Phase

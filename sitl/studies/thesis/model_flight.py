@@ -69,7 +69,7 @@ class Pilot:
         self._thrust_01 = hover_01
         brake_m_s2 = config.separation.brake_m_s2
         self._plan_buffer = PlanBuffer(agent, self._dt_us, self._steps, brake_m_s2)
-        self._replay_us = round(config.agent.failsafe.replay_s * 1e6)
+        self._replay_us = min(round(config.agent.failsafe.replay_s * 1e6), self._steps * self._dt_us - 1)
         self._obstacles = config.obstacles
         self.path: PredictedPath | None = None
         self.failed = 0

@@ -142,6 +142,7 @@ class ModeSelector:
             autopilot_failsafe=state is not None and state.failsafe,
             plan_status=PlanStatus.NONE if plan is None else plan.status,
             last_good_plan_age_us=NO_AGE_US if good is None else now_us + self._delay_us - good.t0_us,
+            last_good_plan_lasts_us=0 if good is None else len(good.virtual_control) * good.dt_us,
             planless_us=0 if self._certified_us is None else now_us - self._certified_us,
             speed_m_s=0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
             phase=self._mission.phase,

@@ -2,9 +2,10 @@
 
 Pure; all state is passed in.
 
-After a plan that must not be flown the modes are, in order: replay the shifted last certified plan while it is recent,
-brake, hold, land. While the vehicle's state is stale or the estimate lost (STATE_STALE) nothing is sent, so the vehicle
-does what its autopilot's own failsafe is set to by `agent.autopilot_params` (`swarmctl/agent/setup.py`): it lands.
+After a plan that must not be flown the modes are, in order: replay the shifted last certified plan while it is recent
+and has inputs left, brake, hold, land. While the vehicle's state is stale or the estimate lost (STATE_STALE) nothing is
+sent, so the vehicle does what its autopilot's own failsafe is set to by `agent.autopilot_params`
+(`swarmctl/agent/setup.py`): it lands.
 
 The mode is how this tick is flown. What wears out slowly leaves time for more: the second table escalates, from a
 warning to the way back to a landing in place, under the agent's own plan.
@@ -29,7 +30,7 @@ class FailsafeParams(Params):
     """Time limits and thresholds of the failsafe."""
 
     state_max_age_s: float = Field(0.2, gt=0, le=5)  # an older vehicle state is stale
-    replay_s: float = Field(0.4, ge=0, le=5)  # longest replay of the last certified plan
+    replay_s: float = Field(0.4, ge=0, le=5)  # longest replay of the last certified plan, which ends with it
     hold_s: float = Field(5.0, ge=0, le=600)  # longest hold without a plan; then land
     rest_speed_m_s: float = Field(0.2, gt=0, le=5)  # a faster vehicle brakes before it holds
     battery_warn_01: float = Field(0.3, ge=0, le=1)  # an alert below this charge; 0, as in the next two: never
@@ -186,7 +187,8 @@ def _taken_over(h: Health, _: FailsafeParams) -> bool:
 
 
 def _plan_is_young(h: Health, p: FailsafeParams) -> bool:
-    return h.plan_status is not PlanStatus.OK and 0 <= h.last_good_plan_age_us <= p.replay_s * 1e6
+    has_input = 0 <= h.last_good_plan_age_us < h.last_good_plan_lasts_us
+    return h.plan_status is not PlanStatus.OK and has_input and h.last_good_plan_age_us <= p.replay_s * 1e6
 
 
 def _moving(h: Health, p: FailsafeParams) -> bool:

@@ -201,6 +201,18 @@ def test_a_state_that_comes_back_is_flown_from_again() -> None:
 
 
 @pytest.mark.parametrize("status", BAD)
+def test_no_plan_is_replayed_past_its_end_where_its_last_input_would_be_held(status: PlanStatus) -> None:
+    bench = Bench("agent.failsafe.replay_s=5")
+    bench.fly(vel_ned_m_s=np.array([2.0, 0.0, 0.0]))
+    good = bench.tick()
+    assert good is not None
+    for _ in range(200):
+        flown = bench.tick(status)
+        assert (flown is good) is (bench.now_us + DELAY_US < good.t0_us + STEPS * DT_US)
+    assert bench.mode is Mode.BRAKE
+
+
+@pytest.mark.parametrize("status", BAD)
 @pytest.mark.parametrize(("speed_m_s", "then"), [(0.5, Mode.BRAKE), (0.1, Mode.HOLD)])
 def test_without_a_plan_the_last_good_one_is_flown_then_it_brakes_holds_and_is_landed(
     status: PlanStatus, speed_m_s: float, then: Mode

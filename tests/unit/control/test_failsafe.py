@@ -18,6 +18,7 @@ GOOD = Health(
     autopilot_failsafe=False,
     plan_status=PlanStatus.OK,
     last_good_plan_age_us=0,
+    last_good_plan_lasts_us=800_000,
     planless_us=0,
     speed_m_s=1.0,
     phase=Phase.TRACK,
@@ -82,6 +83,15 @@ def test_the_ladder_after_a_bad_plan(status: PlanStatus) -> None:
 
 def test_a_plan_that_begins_one_delay_ahead_is_recent() -> None:
     assert mode_of(plan_status=PlanStatus.RESIDUAL, last_good_plan_age_us=60_000) is Mode.REPLAY
+
+
+@pytest.mark.parametrize("status", BAD_PLANS)
+@pytest.mark.parametrize("lasts_us", [200_000, 400_000, 800_000])
+def test_a_replay_ends_with_its_plan_however_long_it_may_last(status: PlanStatus, lasts_us: int) -> None:
+    bad: dict[str, Any] = {"plan_status": status, "last_good_plan_lasts_us": lasts_us}
+    long = FailsafeParams(replay_s=5.0)
+    for age_us, mode in ((lasts_us - 1, Mode.REPLAY), (lasts_us, Mode.BRAKE), (4_900_000, Mode.BRAKE)):
+        assert decide(replace(GOOD, **bad, last_good_plan_age_us=age_us), long).mode is mode
 
 
 @pytest.mark.parametrize("status", BAD_PLANS)
