@@ -54,6 +54,27 @@ def within_tilt(virtual_control: Array, params: VehicleModelParams) -> Array:
     return _shortened(virtual_control, params.u_max())
 
 
+def within_bounds(virtual_control: Array, hover_thrust_01: float, params: VehicleModelParams) -> Array:
+    """Return virtual controls (3,) that `setpoint_of` does not change any more: within largest tilt and thrust range.
+
+    Args:
+        virtual_control: u_x, u_y, and thrust over mass [m/s2].
+        hover_thrust_01: thrust that holds the weight.
+        params: bounds.
+    """
+    shortened = within_tilt(virtual_control, params)
+    ux, uy, specific = shortened.tolist()
+    asked_01 = hover_thrust_01 * specific / GRAVITY_M_S2
+    bounded_01 = _within_range(asked_01, params)
+    if bounded_01 == asked_01 or not math.isfinite(asked_01):
+        return shortened
+    return np.array([ux, uy, GRAVITY_M_S2 * bounded_01 / hover_thrust_01])
+
+
+def _within_range(thrust_01: float, params: VehicleModelParams) -> float:
+    return min(params.thrust_max_01, max(params.thrust_min_01, thrust_01))
+
+
 def holding_height(virtual_control: Array, below_m: float, thrust_max_m_s2: float) -> Array:
     """Return virtual controls (3,) whose tilt is shortened until the largest thrust carries a sunken vehicle up again.
 
@@ -96,5 +117,5 @@ def setpoint_of(
     tilt = math.hypot(ux, uy)
     down = np.array([ux, uy, math.sqrt(max(0.0, 1.0 - tilt * tilt))])
     thrust = hover_thrust_01 * specific / GRAVITY_M_S2
-    thrust = min(params.thrust_max_01, max(params.thrust_min_01, thrust)) if math.isfinite(thrust) else math.nan
+    thrust = _within_range(thrust, params) if math.isfinite(thrust) else math.nan
     return AttitudeSetpoint(_ATTITUDES[params.heading](down, yaw_rad), thrust, now_us + VALID_US)

@@ -12,7 +12,7 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.mpc.problem import Start
 from swarmctl.control.reference.heading import Heading
-from swarmctl.control.setpoint import SetpointHold, holding_height, setpoint_of, within_tilt
+from swarmctl.control.setpoint import SetpointHold, holding_height, setpoint_of, within_bounds
 from swarmctl.core.frames import euler_from_quat
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Array, AttitudeSetpoint, Plan, VehicleState
@@ -41,7 +41,7 @@ class SetpointOutput:
         alerts: Alerts,
     ) -> None:
         self._model, self._heading = setup.vehicle_model, Heading(setup.mission.yaw_rad)
-        self._thrust_max_m_s2 = min(setup.controller.mpc.thrust_max_m_s2, self._model.thrust_range_m_s2()[1])
+        self._thrust_max_m_s2 = setup.controller.mpc.most_thrust_m_s2(self._model)
         self._ports, self._safety_filter, self._own_state = ports, safety_filter, own_state
         self._references, self._alerts = references, alerts
         self._hold = SetpointHold()
@@ -83,7 +83,7 @@ class SetpointOutput:
             flies=flies,
             committed_peers=committed_peers,
         )
-        virtual_control = within_tilt(virtual_control, self._model)  # what is remembered is what is flown
+        virtual_control = within_bounds(virtual_control, estimate.hover_thrust_01, self._model)
         if not flies and state is not None:
             self._heading.begin(euler_from_quat(state.q_nb)[2])
         yaw_rad = self._heading.at(now_us, self._references.heading_rad(self._ports.utc_of_us(now_us)))
@@ -92,7 +92,7 @@ class SetpointOutput:
             self._alerts.put("setpoint", f"setpoint refused: {refused}", now_us)
             self._ports.note("setpoint_refused", reason=refused)
             return None
-        self._own_state.sent(now_us, virtual_control, setpoint.thrust_01)
+        self._own_state.sent(now_us, virtual_control, setpoint.thrust_01)  # what is remembered is what is flown
         return setpoint
 
     def _holding_height(

@@ -40,7 +40,7 @@ class JointMpc:
 
         def joint(room: int) -> CondensedMpc:
             return CondensedMpc(
-                (*params.horizontal(vehicle), params.vertical()),
+                (*params.horizontal(vehicle), params.vertical(vehicle)),
                 params.horizon_of_xy(vehicle),
                 room,
                 setup.separation.relax_01,

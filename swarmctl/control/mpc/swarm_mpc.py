@@ -62,7 +62,7 @@ class MpcParams(Params):
     x: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
     y: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
     thrust_min_m_s2: float = Field(0.0, ge=-20, le=9)  # thesis -20 (a rotor can't pull)
-    thrust_max_m_s2: float = Field(20.0, gt=9.9, le=100)  # largest thrust over mass
+    thrust_max_m_s2: float = Field(20.0, gt=9.9, le=100)  # largest thrust over mass; never more than the vehicle has
     dthrust_max_m_s2: float = Field(5.0, gt=0, le=100)  # per step
     u_max: float = Field(0.2, gt=0, lt=1)  # sine of the tilt, each axis
     du_max: float = Field(0.05, gt=0, lt=1)  # per step
@@ -73,18 +73,22 @@ class MpcParams(Params):
 
     def accel_max_m_s2(self, vehicle: VehicleModelParams) -> float:
         """Return the largest horizontal acceleration in level flight, by tilt and thrust."""
-        by_thrust = math.sqrt(self.thrust_max_m_s2**2 - GRAVITY_M_S2**2)
+        by_thrust = math.sqrt(max(0.0, self.most_thrust_m_s2(vehicle) ** 2 - GRAVITY_M_S2**2))
         return min(by_thrust, GRAVITY_M_S2 * math.tan(math.asin(min(self.u_max, vehicle.u_max()))))
+
+    def most_thrust_m_s2(self, vehicle: VehicleModelParams) -> float:
+        """Return the largest thrust over mass that plans use: no more than the vehicle has."""
+        return min(self.thrust_max_m_s2, vehicle.thrust_range_m_s2()[1])
 
     def drift_m(self, gust_m_s: float, vehicle: VehicleModelParams) -> float:
         """Return how far a sudden wind blows a vehicle under this controller; see `VehicleModelParams.drift_m`."""
         at_once_m_s2 = GRAVITY_M_S2 * min(self.u_max, vehicle.u_max())
         return vehicle.drift_m(gust_m_s, at_once_m_s2=at_once_m_s2, accel_max_m_s2=self.accel_max_m_s2(vehicle))
 
-    def vertical(self) -> Axis:
+    def vertical(self, vehicle: VehicleModelParams) -> Axis:
         """Return the z axis: its input is thrust over mass, realised at once."""
         w = self.z
-        least, most, step = self.thrust_min_m_s2, self.thrust_max_m_s2, self.dthrust_max_m_s2
+        least, most, step = self.thrust_min_m_s2, self.most_thrust_m_s2(vehicle), self.dthrust_max_m_s2
         return Axis(
             q_pos=w.q_pos,
             q_vel=w.q_vel,
@@ -144,7 +148,7 @@ class SwarmMpc:
         self.steps = params.horizon_xy
         self.longest = max(params.horizon_xy, params.horizon_z)  # reference steps needed
         self._z = CondensedMpc(
-            (params.vertical(),),
+            (params.vertical(vehicle),),
             params.horizon_of_z(vehicle),
             0,
             1.0,

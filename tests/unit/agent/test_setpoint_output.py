@@ -289,6 +289,20 @@ def test_a_tilt_beyond_the_vehicles_is_shortened_and_remembered_so() -> None:
     assert thrust_01 == pytest.approx(sent[4], abs=1e-6)
 
 
+@pytest.mark.parametrize(("hover_01", "asked_m_s2", "flown_01"), [(0.8, 15.0, 1.0), (0.5, 25.0, 1.0), (0.5, 0.0, 0.05)])
+def test_thrust_that_the_vehicle_has_not_is_remembered_as_what_is_flown(
+    hover_01: float, asked_m_s2: float, flown_01: float
+) -> None:
+    bench = Bench()
+    bench.estimate(hover_thrust_01=hover_01)
+    sent = bench.send(bench.plan((0.1, 0.0, asked_m_s2)))
+    ((remembered, thrust_01),) = bench.remembered
+    assert sent is not None
+    assert sent[4] == pytest.approx(flown_01, abs=1e-6)
+    assert thrust_01 == pytest.approx(flown_01, abs=1e-9)
+    assert remembered == pytest.approx([0.1, 0.0, flown_01 * 9.80665 / hover_01], rel=1e-3)
+
+
 @pytest.mark.parametrize(("flies", "enabled", "acts"), [(True, True, True), (False, True, False), (True, False, False)])
 def test_who_flies_is_kept_from_bodies_and_who_does_not_sends_what_is_planned(
     flies: bool, enabled: bool, acts: bool

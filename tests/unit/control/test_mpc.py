@@ -10,7 +10,7 @@ import pytest
 
 from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
-from swarmctl.control.model import acceleration
+from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.axes import AxesSolution
 from swarmctl.control.mpc.judgement import RESIDUAL_LIMIT_M
 from swarmctl.control.mpc.problem import Problem, Start
@@ -114,6 +114,17 @@ def test_bounds_of_thrust_and_tilt_hold() -> None:
     assert np.abs(plan.virtual_control[:, :2]).max() <= 0.2 + 2e-3
     assert np.abs(np.diff(plan.virtual_control[:, :2], axis=0, prepend=np.zeros((1, 2)))).max() <= 0.05 + 1e-9
     assert np.abs(np.diff(plan.virtual_control[:, 2], prepend=G)).max() <= 5.0 + 1e-9
+
+
+@pytest.mark.parametrize("kind", ["dmpc", "dmpc3", "mpc"])
+def test_no_plan_uses_thrust_that_the_vehicle_has_not(kind: Literal["dmpc", "dmpc3", "mpc"]) -> None:
+    heavy = VehicleModelParams(hover_thrust_01=0.8)
+    mpc = make_controller(ControllerParams(kind=kind), builders.controller_setup(vehicle=heavy))
+    most_m_s2 = heavy.thrust_range_m_s2()[1]
+    thrust_m_s2 = mpc.plan(problem((0.0, 0.0, -3.0))).virtual_control[:, 2]
+    assert thrust_m_s2.max() == pytest.approx(most_m_s2, abs=1e-6)
+    level_m_s2 = MpcParams(u_max=0.9).accel_max_m_s2(heavy.model_copy(update={"tilt_max_rad": 1.2}))
+    assert math.hypot(level_m_s2, G) == pytest.approx(most_m_s2, abs=0.01)
 
 
 @pytest.mark.parametrize("down_m", [-100.0, -20.0, 20.0, 100.0])
