@@ -20,6 +20,7 @@ from swarmctl.configuration.constraints import (
     obstacle_problems,
     own_controller_problems,
     path_sharing_problems,
+    planned_braking_problems,
     separation_problems,
     shared_process_problems,
     simulated_host_problems,
@@ -173,6 +174,10 @@ CONSTRAINTS = (
     Constraint(
         {"vehicle_model", "vehicles", "agent", "separation"},
         lambda c: braking_problems(c.vehicle_models, c.agent, c.separation),
+    ),
+    Constraint(
+        {"vehicle_model", "vehicles", "agent", "separation", "controller", "volume"},
+        lambda c: planned_braking_problems(c.vehicle_models, c.agent, c.separation, c.controller, c.volume),
     ),
     Constraint({"sitl"}, lambda c: simulated_speed_problems(c.sitl)),
     Constraint({"mission"}, lambda c: c.mission.kind_problems()),

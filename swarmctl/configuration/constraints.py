@@ -13,6 +13,7 @@ from swarmctl.bus.network.hosts import HostParams
 from swarmctl.configuration.sections import LimitParams, SitlParams, StartParams, SwarmParams, VehicleParams
 from swarmctl.control.collision.barrier import BarrierParams
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
+from swarmctl.control.commit.commit_params import planning
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.controllers.pid import PID, PidParams
 from swarmctl.control.model import VehicleModelParams
@@ -117,7 +118,7 @@ def braking_problems(
     models: Sequence[VehicleModelParams], agent: AgentParams, separation: SeparationParams
 ) -> Iterator[str]:
     """Yield which braking is relied on that a vehicle does not have at the tilt it is allowed."""
-    most_m_s2 = GRAVITY_M_S2 * math.tan(min(model.tilt_max_rad for model in models))
+    most_m_s2 = _tilted_m_s2(models)
     brakes_m_s2 = {
         "agent.barrier.brake_m_s2": agent.barrier.brake_m_s2,
         "agent.commit.brake_m_s2": agent.commit.brake_m_s2,
@@ -130,6 +131,49 @@ def braking_problems(
                 f"{key} = {brake_m_s2:g}: more than the {most_m_s2:.2f} m/s2 that vehicle_model.tilt_max_rad allows; "
                 "lower it, or allow more tilt"
             )
+
+
+def planned_braking_problems(
+    models: Sequence[VehicleModelParams],
+    agent: AgentParams,
+    separation: SeparationParams,
+    controller: ControllerParams,
+    volume: VolumeParams,
+) -> Iterator[str]:
+    """Yield which braking is relied on that plans do not have: they use less tilt, and less thrust, than vehicles.
+
+    Own controllers are bound by the vehicle alone, and so is the PID.
+    """
+    mpc, limits = controller.mpc, f"controller.mpc.u_max = {controller.mpc.u_max:g} and thrust allow"
+    most_m_s2 = min(mpc.accel_max_m_s2(model) for model in models)
+    if separation.mode == "guaranteed":
+        committed_m_s2 = min(planning(mpc, agent.commit, model).accel_max_m_s2(model) for model in models)
+        share = f"agent.commit.tilt_fraction_01 = {agent.commit.tilt_fraction_01:g} of {limits}"
+        yield from _beyond("agent.commit.brake_m_s2", agent.commit.brake_m_s2, committed_m_s2, share)
+    if controller.plans or not (controller.is_own or controller.follows_reference):
+        yield from _beyond("agent.state_machine.accel_m_s2", agent.state_machine.accel_m_s2, most_m_s2, limits)
+    if not volume.corners_ne_m:
+        return
+    if controller.is_own:
+        most_m_s2 = _tilted_m_s2(models)
+        limits = "vehicle_model.tilt_max_rad allows"
+    yield from _beyond("volume.brake_m_s2", volume.brake_m_s2, most_m_s2, limits)
+    ranges_m_s2 = [model.thrust_range_m_s2() for model in models]
+    ranges_m_s2 += [] if controller.is_own else [(mpc.thrust_min_m_s2, mpc.thrust_max_m_s2)]
+    rises_m_s2 = min(most for _, most in ranges_m_s2) - GRAVITY_M_S2
+    falls_m_s2 = GRAVITY_M_S2 - max(least for least, _ in ranges_m_s2)
+    left = "thrust (vehicle_model, controller.mpc) leaves beside the weight"
+    yield from _beyond("volume.brake_z_m_s2", volume.brake_z_m_s2, min(rises_m_s2, falls_m_s2), left)
+
+
+def _tilted_m_s2(models: Sequence[VehicleModelParams]) -> float:
+    """Return the largest horizontal acceleration of level flight that the tilt of every model allows."""
+    return GRAVITY_M_S2 * math.tan(min(model.tilt_max_rad for model in models))
+
+
+def _beyond(key: str, brake_m_s2: float, most_m_s2: float, bounds: str) -> Iterator[str]:
+    if brake_m_s2 > most_m_s2:
+        yield f"{key} = {brake_m_s2:g}: more than the {most_m_s2:.2f} m/s2 that {bounds}; lower it, or allow more"
 
 
 def volume_problems(

@@ -365,6 +365,47 @@ def test_braking_that_tilt_does_not_give_is_refused(key: str) -> None:
     load(None, [*hovering, f"{key}=0.9"])
 
 
+VOLUME = (
+    "volume.corners_ne_m=[[-20,-20],[20,-20],[20,20],[-20,20]]",
+    "volume.floor_z_m=1",
+    "volume.ceiling_z_m=-30",
+)
+GUARANTEED = ("separation.mode=guaranteed", "controller.kind=pid")
+HEAVY = (*VOLUME, "vehicle_model.hover_thrust_01=0.8")
+
+
+@pytest.mark.parametrize(
+    ("given", "key", "has", "too_much"),
+    [
+        ((), "agent.state_machine.accel_m_s2", "2.00", "2.1"),
+        (("controller.kind=open_loop",), "agent.state_machine.accel_m_s2", "2.00", "2.1"),
+        (VOLUME, "volume.brake_m_s2", "2.00", "6"),
+        ((*VOLUME, "controller.kind=dmpc3"), "volume.brake_m_s2", "2.00", "6"),
+        (HEAVY, "volume.brake_z_m_s2", "2.45", "3"),
+        (VOLUME, "volume.brake_z_m_s2", "8.83", "9"),
+        (GUARANTEED, "agent.commit.brake_m_s2", "1.59", "1.6"),
+        ((*GUARANTEED, "controller.mpc.u_max=0.9"), "agent.commit.brake_m_s2", "4.97", "5"),
+    ],
+)
+def test_braking_that_plans_do_not_have_is_refused(given: tuple[str, ...], key: str, has: str, too_much: str) -> None:
+    hovering = ["mission.kind=hover", "start.center_ned_m=[0,0,-3]", *given]
+    with pytest.raises(ConfigError, match=re.escape(f"{key} = {too_much}: more than the {has} m/s2 that ")):
+        load(None, [*hovering, f"{key}={too_much}"])
+    load(None, [*hovering, f"{key}={float(has) - 0.01}"])
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("agent.commit.brake_m_s2=6",),  # nothing is committed to
+        ("volume.brake_m_s2=20", "volume.brake_z_m_s2=20"),  # there is no volume
+        ("controller.kind=pid", "agent.state_machine.accel_m_s2=5"),  # it tilts as far as the vehicle may
+    ],
+)
+def test_braking_that_no_plan_relies_on_is_accepted(given: tuple[str, ...]) -> None:
+    load(None, ["mission.kind=hover", "vehicle_model.tilt_max_rad=0.6", *given])
+
+
 def test_vehicles_beside_the_simulator_are_refused(tmp_path: Path) -> None:
     path = vehicles(tmp_path, "udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")
     (problem,) = refusals(path, "sitl.enabled=true")

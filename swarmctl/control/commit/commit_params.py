@@ -57,7 +57,7 @@ def following(mpc: MpcParams, params: CommitParams) -> MpcParams:
     return mpc.model_copy(update={"z": params.follow_z, "control_z": max(mpc.control_z, _FOLLOWING_MOVES_Z)})
 
 
-def planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
+def planning(mpc: MpcParams, params: CommitParams, vehicle: VehicleModelParams) -> MpcParams:
     """Return controller parameters on the planner's grid, with bounds that leave room for tracking."""
     return mpc.model_copy(
         update={
@@ -69,7 +69,7 @@ def planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
             "control_xy": params.moves,
             "horizon_xy": params.horizon,
             "blocking_xy": "none",
-            "u_max": params.tilt_fraction_01 * mpc.u_max,
+            "u_max": params.tilt_fraction_01 * min(mpc.u_max, vehicle.u_max()),
             "thrust_min_m_s2": max(mpc.thrust_min_m_s2, 0.7 * GRAVITY_M_S2),
             "thrust_max_m_s2": min(mpc.thrust_max_m_s2, 1.4 * GRAVITY_M_S2),
             "terminal_z": "none",

@@ -83,7 +83,7 @@ class TrajectoryPlanner:
         right_of_way = separation.model_copy(
             update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
         )
-        bounded = planning(mpc, params)
+        bounded = planning(mpc, params, vehicle)
         self._hardest_m_s2 = bounded.accel_max_m_s2(vehicle)
         self._mpc = SwarmMpc(
             bounded,

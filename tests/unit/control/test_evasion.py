@@ -25,7 +25,7 @@ def planned_after(since_us: int) -> Trajectory:
         0,
         CommitParams(),
         MpcParams(u_max=0.75, dt_s=0.05),
-        VehicleModelParams(drag_1_s=1.0),
+        VehicleModelParams(drag_1_s=1.0, tilt_max_rad=0.85),
         SeparationParams(),
         max_keep_outs=1,
         stopwatch_ns=lambda: 0,

@@ -262,7 +262,9 @@ def test_what_is_lost_at_speed_is_stopped_inside(
     assert np.allclose(np.cross(stopped.pos_ned_m[-1] - stopped.pos_ned_m[0], vel), 0.0, atol=1e-9), "straight ahead"
 
 
-@pytest.mark.parametrize(("tilt_max_rad", "u_max"), [(0.6, 0.8 * 0.6), (0.3, np.sin(0.3))])
+@pytest.mark.parametrize(
+    ("tilt_max_rad", "u_max"), [(0.9, 0.8 * 0.6), (0.6, 0.8 * np.sin(0.6)), (0.3, 0.8 * np.sin(0.3))]
+)
 def test_it_is_stopped_no_harder_than_plans_and_vehicle_may_and_no_harder_than_needed(
     tilt_max_rad: float, u_max: float
 ) -> None:
