@@ -21,7 +21,7 @@ from swarmctl.control.collision.separation import (
 )
 from swarmctl.control.commit.commit_params import CommitParams, planning
 from swarmctl.control.commit.halting import halted, places_apart_m
-from swarmctl.control.commit.situation import Situation, with_run_up
+from swarmctl.control.commit.situation import Situation, lasting, with_run_up
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem, Start
@@ -42,7 +42,7 @@ _WAY_TURNS_RAD = (0.0, 0.3, -0.3, 0.6, -0.6)
 _HALT_DELAY_S = 0.6  # a stop along the own places that begins so much later must still be clear, or one begins sooner
 _HALTS_AFTER_S = (0.4, 0.2, 0.0)
 _UNSURE_M = 0.3  # of where vehicles are after 2 s without setpoints, as measured
-_BRAKING_TAIL_S = 2.0  # part of the final braking that is checked against keep-outs
+_BRAKING_TAIL_S = 2.0  # part of the final braking for which keep-outs are told; `lasting` predicts them beyond it
 _OUTWARD_TOLERANCE_M = (
     0.01  # farther out of the flight volume allowed to proposals of a vehicle that is outside already
 )
@@ -188,9 +188,9 @@ class TrajectoryPlanner:
                 now.begin_us, self.dt_us, plan.pos_ned_m, plan.vel_ned_m_s, brake_m_s2=self._params.brake_m_s2
             )
         yield self.stopping_candidate(committed, now.begin_us, now.utc_us)
-        heights_m = [k.radius_m for k in now.others if not k.any_height]
-        if heights_m:
-            yield self._climbing_candidate(committed, now.begin_us, max(heights_m) + INTERPOLATION_MARGIN_M)
+        passable = [k for k in now.others if not k.any_height]
+        if passable:
+            yield self._climbing_candidate(committed, now.begin_us, passable)
 
     def _halting_candidates(self, committed: Trajectory, now: Situation, after_s: float) -> Iterator[Trajectory]:
         """Yield stops along the committed trajectory that begin so much later and need no acknowledgement."""
@@ -205,10 +205,11 @@ class TrajectoryPlanner:
         apart_m = places_apart_m(trajectory, begin_us, now.followed, now.utc_us, self._separation.downwash)
         return apart_m >= self._budget.committed_m + INTERPOLATION_MARGIN_M
 
-    def _climbing_candidate(self, committed: Trajectory, begin_us: int, height_m: float) -> Trajectory:
-        """Return the committed trajectory, left at `begin_us` for a climb by `height_m` over where it would stop."""
+    def _climbing_candidate(self, committed: Trajectory, begin_us: int, passable: Sequence[KeepOut]) -> Trajectory:
+        """Return the committed trajectory, left at `begin_us` for a climb from where it would stop over keep-outs."""
         pos, vel = (found[0] for found in committed.sample(np.array([begin_us])))
-        above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m - [0.0, 0.0, height_m]
+        above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m.copy()
+        above[2] = _height_above(float(above[2]), passable)
         return self._on_grid(quintic_to(pos, vel, above, _CLIMB_M_S, accel_m_s2=_CLIMB_M_S2), begin_us)
 
     def _ways_along_path(self, committed: Trajectory, now: Situation) -> Iterator[Trajectory]:
@@ -307,8 +308,13 @@ class TrajectoryPlanner:
         return bool(((trajectory.pos_ned_m @ normals - kept).min(axis=0) >= allowed).all())
 
     def _clearance_m(self, trajectory: Trajectory, now: Situation) -> float:
-        times = now.begin_us + np.arange(self.steps + 1) * self.dt_us
-        return certify(trajectory.sample(times)[0], now.others, 0)
+        """Return the smallest margin [m] of a trajectory to `now.others`, until it is at rest however fast it is."""
+        beyond = max(0, -(-(trajectory.end_utc_us - now.begin_us) // self.dt_us) - self.steps)
+        others = now.others
+        if beyond and others:
+            others = lasting(others, beyond, self.dt_us, self._separation.brake_m_s2)
+        times = now.begin_us + np.arange(self.steps + beyond + 1) * self.dt_us
+        return certify(trajectory.sample(times)[0], others, 0)
 
     def _margin_m(
         self, trajectory: Trajectory, utc_us: int, known: Sequence[Trajectory], spare_m: float = 0.0
@@ -340,6 +346,20 @@ class TrajectoryPlanner:
             for points, agent, spread_m in zip(where, agents, spreads_m, strict=True)
         ]
         return KeepOuts(found, where)
+
+
+def _height_above(z_ned_m: float, passable: Sequence[KeepOut]) -> float:
+    """Return the height nearest above `z_ned_m`, NED [m], at which a vehicle passes over the keep-outs from there on.
+
+    It climbs over those that are passed neither above nor below at its own height, and where that leads it to others,
+    over these.
+    """
+    reaches = [(k.radius_m / k.vertical_01 + INTERPOLATION_MARGIN_M, k.pos_ned_m[:, 2]) for k in passable]
+    bands = [(float(z_m.min()) - reach_m, float(z_m.max()) + reach_m) for reach_m, z_m in reaches]
+    for top_m, bottom_m in sorted(bands, key=lambda band: band[1], reverse=True):
+        if top_m < z_ned_m < bottom_m:
+            z_ned_m = top_m
+    return z_ned_m
 
 
 def _first_steps(keep_out: KeepOut, steps: int) -> KeepOut:
