@@ -15,9 +15,9 @@ from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.sharing.interest import Interest
 from swarmctl.agent.sharing.telemetry_publisher import TelemetryPublisher
-from swarmctl.control.commit.commit_params import CommitParams, following
+from swarmctl.control.commit.commit_params import CommitParams, following, interpolation_margin_m
 from swarmctl.control.commit.reach import FarPeers
-from swarmctl.control.commit.trajectory_planner import INTERPOLATION_MARGIN_M, TrajectoryPlanner
+from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
@@ -59,11 +59,12 @@ def _guaranteed(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> Sep
 def _make_far_peers(setup: AgentSetup, commit: CommitParams, world_model: WorldModel) -> FarPeers:
     sharing, separation = setup.params.path_sharing, setup.separation
     speed_m_s = sharing.speed_m_s if sharing.far_hz else 0.0
+    spare_m = interpolation_margin_m(setup.controller.mpc, commit, setup.vehicle_model)
     return FarPeers(
         setup.peers,
         speed_m_s=speed_m_s,
         stretch_m=commit.stretch_m(speed_m_s),
-        apart_m=separation.downwash * (separation.budget.committed_m + INTERPOLATION_MARGIN_M),
+        apart_m=separation.downwash * (separation.budget.committed_m + spare_m),
         ahead_us=world_model.clocks.ahead_us,
     )
 

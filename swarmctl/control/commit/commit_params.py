@@ -10,6 +10,7 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 
 _FOLLOWING_MOVES_Z = 10
+_MARGIN_M, _MARGIN_M_S2, _MARGIN_S = 0.01, 4.0, 0.1  # two cubics of so much acceleration leave their chords by so much
 _MODEST_LEAD_S = 0.5  # proposals with a longer lead may be longer than others count on
 
 
@@ -55,6 +56,15 @@ def following(mpc: MpcParams, params: CommitParams) -> MpcParams:
     With the three moves of the thesis, heights of a commitment that begins to climb are missed by 0.16 m.
     """
     return mpc.model_copy(update={"z": params.follow_z, "control_z": max(mpc.control_z, _FOLLOWING_MOVES_Z)})
+
+
+def interpolation_margin_m(mpc: MpcParams, params: CommitParams, vehicle: VehicleModelParams) -> float:
+    """Return what proposals keep on top, as they are checked as straight lines between points and flown as cubics.
+
+    With an acceleration of a that leaves the line by a dt_s^2 / 8, for each of two vehicles.
+    """
+    accel_m_s2 = planning(mpc, params, vehicle).accel_max_m_s2(vehicle)
+    return _MARGIN_M * max(1.0, max(1.0, accel_m_s2 / _MARGIN_M_S2) * (params.dt_s / _MARGIN_S) ** 2)
 
 
 def planning(mpc: MpcParams, params: CommitParams, vehicle: VehicleModelParams) -> MpcParams:

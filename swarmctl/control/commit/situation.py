@@ -52,7 +52,7 @@ class Situation:
 def lasting(keep_outs: Sequence[KeepOut], steps: int, dt_us: int, brake_m_s2: float) -> KeepOuts:
     """Return keep-outs for so many steps more: obstacles move on as they do, vehicles brake to rest."""
     dt_s, found = 1e-6 * dt_us, []
-    ahead_s = dt_s * np.arange(1, steps + 1)
+    ahead_s = dt_s * np.arange(1, steps + 1, dtype=np.float64)
     for keep_out in keep_outs:
         pos = keep_out.pos_ned_m
         vel = (pos[-1] - pos[-2]) / dt_s

@@ -19,7 +19,7 @@ from swarmctl.control.collision.separation import (
     certify,
     keep_out_of_commitment,
 )
-from swarmctl.control.commit.commit_params import CommitParams, planning
+from swarmctl.control.commit.commit_params import CommitParams, interpolation_margin_m, planning
 from swarmctl.control.commit.halting import halted, places_apart_m
 from swarmctl.control.commit.situation import Situation, lasting, with_run_up
 from swarmctl.control.model import VehicleModelParams
@@ -47,7 +47,6 @@ _OUTWARD_TOLERANCE_M = (
     0.01  # farther out of the flight volume allowed to proposals of a vehicle that is outside already
 )
 _APPROACH_TOLERANCE_M = 0.001  # approach allowed to trajectories that are too close already
-INTERPOLATION_MARGIN_M = 0.01  # kept by proposals on top: they are checked as straight lines between points
 
 
 class TrajectoryPlanner:
@@ -85,6 +84,7 @@ class TrajectoryPlanner:
         )
         bounded = planning(mpc, params, vehicle)
         self._hardest_m_s2 = bounded.accel_max_m_s2(vehicle)
+        self._interpolation_margin_m = interpolation_margin_m(mpc, params, vehicle)
         self._mpc = SwarmMpc(
             bounded,
             ControllerSetup(
@@ -203,13 +203,13 @@ class TrajectoryPlanner:
     def _is_apart(self, trajectory: Trajectory, begin_us: int, now: Situation) -> bool:
         """Tell whether all places of a trajectory from a time on are apart from all that peers may pass from now on."""
         apart_m = places_apart_m(trajectory, begin_us, now.followed, now.utc_us, self._separation.downwash)
-        return apart_m >= self._budget.committed_m + INTERPOLATION_MARGIN_M
+        return apart_m >= self._budget.committed_m + self._interpolation_margin_m
 
     def _climbing_candidate(self, committed: Trajectory, begin_us: int, passable: Sequence[KeepOut]) -> Trajectory:
         """Return the committed trajectory, left at `begin_us` for a climb from where it would stop over keep-outs."""
         pos, vel = (found[0] for found in committed.sample(np.array([begin_us])))
         above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m.copy()
-        above[2] = _height_above(float(above[2]), passable)
+        above[2] = _height_above(float(above[2]), passable, self._interpolation_margin_m)
         return self._on_grid(quintic_to(pos, vel, above, _CLIMB_M_S, accel_m_s2=_CLIMB_M_S2), begin_us)
 
     def _ways_along_path(self, committed: Trajectory, now: Situation) -> Iterator[Trajectory]:
@@ -295,7 +295,7 @@ class TrajectoryPlanner:
         whole = joined(committed, leaving, now.utc_us)
         if not self._stays_in_volume(whole, committed, now.utc_us) or not self.is_clear(whole, now):
             return None
-        return None if self.conflicts(whole, now.utc_us, now.followed, INTERPOLATION_MARGIN_M) else whole
+        return None if self.conflicts(whole, now.utc_us, now.followed, self._interpolation_margin_m) else whole
 
     def _stays_in_volume(self, trajectory: Trajectory, committed: Trajectory, utc_us: int) -> bool:
         """Tell whether a trajectory stays in the flight volume, or goes no farther out of it than `committed` does."""
@@ -348,13 +348,13 @@ class TrajectoryPlanner:
         return KeepOuts(found, where)
 
 
-def _height_above(z_ned_m: float, passable: Sequence[KeepOut]) -> float:
+def _height_above(z_ned_m: float, passable: Sequence[KeepOut], spare_m: float) -> float:
     """Return the height nearest above `z_ned_m`, NED [m], at which a vehicle passes over the keep-outs from there on.
 
     It climbs over those that are passed neither above nor below at its own height, and where that leads it to others,
     over these.
     """
-    reaches = [(k.radius_m / k.vertical_01 + INTERPOLATION_MARGIN_M, k.pos_ned_m[:, 2]) for k in passable]
+    reaches = [(k.radius_m / k.vertical_01 + spare_m, k.pos_ned_m[:, 2]) for k in passable]
     bands = [(float(z_m.min()) - reach_m, float(z_m.max()) + reach_m) for reach_m, z_m in reaches]
     for top_m, bottom_m in sorted(bands, key=lambda band: band[1], reverse=True):
         if top_m < z_ned_m < bottom_m:

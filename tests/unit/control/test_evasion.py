@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.separation import KeepOuts, SeparationParams, keep_out_of_obstacle, keep_out_of_peer
-from swarmctl.control.commit.commit_params import CommitParams
+from swarmctl.control.commit.commit_params import CommitParams, interpolation_margin_m
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.model import VehicleModelParams
@@ -64,9 +64,9 @@ def test_negative_control_taken_for_at_rest_before_it_falls_and_races(monkeypatc
     assert np.linalg.norm(found.vel_ned_m_s, axis=1).max() > SPEED_M_S + 1.0
 
 
-def planner(separation: SeparationParams) -> TrajectoryPlanner:
+def planner(separation: SeparationParams, params: CommitParams | None = None) -> TrajectoryPlanner:
     """Return a planner of the thesis' vehicles."""
-    given = (CommitParams(), MpcParams(), VehicleModelParams(), separation)
+    given = (params or CommitParams(), MpcParams(), VehicleModelParams(), separation)
     return TrajectoryPlanner(0, *given, max_keep_outs=2, stopwatch_ns=lambda: 0)
 
 
@@ -124,3 +124,31 @@ def test_a_climb_goes_over_what_comes_however_high_that_is(downwash: float, high
     *_, climb = plans._evasive_candidates(resting(here, UTC_US, 100_000), now)
     assert -5.0 - climb.pos_ned_m[-1, 2] == pytest.approx(higher_m + 0.9 * downwash, abs=0.02)
     assert plans.is_clear(climb, now)
+
+
+@pytest.mark.parametrize("dt_s", [0.05, 0.1, 0.2, 0.5])
+def test_what_proposals_keep_on_top_covers_what_cubics_leave_their_chords_by(dt_s: float) -> None:
+    """Two come at each other and turn back between two points, where the lines between these are farther apart."""
+    separation, params = SeparationParams(mode="guaranteed"), CommitParams(dt_s=dt_s)
+    plans, dt_us, accel_m_s2 = planner(separation, params), round(1e6 * dt_s), 1.5
+    spare_m = interpolation_margin_m(MpcParams(), params, VehicleModelParams())
+
+    def turning_back(nearest_m: float, side: float) -> Trajectory:
+        since_s = dt_s * (np.arange(round(4.0 / dt_s) + 1) - round(2.0 / dt_s) - 0.5)
+        pos, vel = np.zeros((len(since_s), 3)), np.zeros((len(since_s), 3))
+        pos[:, 0] = side * (0.5 * nearest_m + 0.5 * accel_m_s2 * since_s**2)
+        vel[:, 0] = side * accel_m_s2 * since_s
+        return ending_at_rest(UTC_US, dt_us, pos, vel, brake_m_s2=accel_m_s2)
+
+    def nearest_m(apart_m: float) -> float:
+        t_us = UTC_US + np.arange(0, 4_000_000, 5_000)
+        one, other = (turning_back(apart_m, side).sample(t_us)[0] for side in (-1.0, 1.0))
+        return float(np.linalg.norm(one - other, axis=1).min())
+
+    apart_m = next(
+        gap_m
+        for gap_m in np.arange(0.5, 1.5, 0.001)
+        if not plans.conflicts(turning_back(gap_m, -1.0), UTC_US, [turning_back(gap_m, 1.0)], spare_m)
+    )
+    assert nearest_m(apart_m) >= separation.budget.committed_m
+    assert (spare_m > 0.01) == (dt_s > 0.1), "the default flies as before"
