@@ -27,6 +27,7 @@ from swarmctl.control.mpc.judgement import judged
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.sized_mpc import SizedMpc
 from swarmctl.control.mpc.solvers.qp import QpParams
+from swarmctl.control.mpc.vertical_stop import VerticalStop
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
@@ -175,16 +176,17 @@ class SwarmMpc:
         self._newest: Array | None = None  # (2, Hc) increments of the newest plan
         self._before: Array | None = None  # of the one of the tick before
         self._first_row = self._xy.prediction.first_row()
-        following = np.minimum(np.arange(self.steps), params.horizon_z - 1)
+        following = np.arange(self.steps)
         self._thrust_of = following if params.thrust_ahead == "planned" else 0 * following  # (steps,) of the z plan
+        brake_m_s2 = setup.separation.brake_m_s2 if setup.volume is None else setup.volume.params.brake_z_m_s2
+        self._stop = VerticalStop(params.vertical(vehicle), params.horizon_of_z(vehicle), brake_m_s2)
 
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
         self._before = self._newest
         up = self._solve_z(problem)
         guess = first_guess(problem, self._params.dt_s, self.steps)
-        count = min(self.steps, len(up.pos_m))
-        guess[1 : count + 1, 2] = up.pos_m[:count, 0]
+        guess[1:, 2] = up.pos_m[: self.steps, 0]
         near = partial(
             near_half_spaces,
             problem=problem,
@@ -202,7 +204,7 @@ class SwarmMpc:
         self._newest = None
 
     def _plan(self, problem: Problem, up: AxesSolution, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
-        start, steps, count = problem.start, self.steps, min(self.steps, len(up.pos_m))
+        start, steps = problem.start, self.steps
         asked = AxesProblem(
             pos_m=start.pos_ned_m[:2],
             vel_m_s=start.vel_ned_m_s[:2],
@@ -220,9 +222,7 @@ class SwarmMpc:
         pos, vel, virtual_control = np.empty((steps + 1, 3)), np.zeros((steps + 1, 3)), np.empty((steps, 3))
         pos[0], vel[0] = start.pos_ned_m, start.vel_ned_m_s
         pos[1:, :2], vel[1:, :2], virtual_control[:, :2] = across.pos_m, across.vel_m_s, across.u
-        pos[1 : count + 1, 2:], vel[1 : count + 1, 2:] = up.pos_m[:count], up.vel_m_s[:count]
-        virtual_control[:count, 2:] = up.u[:count]
-        pos[count + 1 :, 2], virtual_control[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
+        pos[1:, 2:], vel[1:, 2:], virtual_control[:, 2:] = up.pos_m[:steps], up.vel_m_s[:steps], up.u[:steps]
         return judged(
             problem,
             pos,
@@ -237,6 +237,7 @@ class SwarmMpc:
         )
 
     def _solve_z(self, problem: Problem) -> AxesSolution:
+        """Return the z plan, of at least as many steps as the x-y plan has."""
         steps, start, reference = self._params.horizon_z, problem.start, problem.reference
         asked = AxesProblem(
             pos_m=start.pos_ned_m[2:],
@@ -247,7 +248,8 @@ class SwarmMpc:
             ref_pos_m=reference.pos_ned_m[1 : steps + 1, 2:],
             ref_vel_m_s=reference.vel_ned_m_s[1 : steps + 1, 2:],
         )
-        return self._z.solve(asked)
+        up = self._z.solve(asked)
+        return up if steps >= self.steps else self._stop.behind(up, asked, self.steps - steps)
 
     def _gain_m_s2(self, up: AxesSolution) -> Array:
         """Return accelerations (steps, 2) of unit inputs of x and y, which thrust over mass makes."""

@@ -16,6 +16,7 @@ from swarmctl.control.mpc.judgement import RESIDUAL_LIMIT_M
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc, closest_keep_outs
+from swarmctl.control.rollout import ModelledVehicle
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 from tests import builders
 
@@ -249,6 +250,31 @@ def test_z_longer_or_shorter_than_xy_gives_a_plan_of_xy_length() -> None:
         assert plan.pos_ned_m.shape == (41, 3)
         assert np.isfinite(plan.pos_ned_m).all()
         assert plan.virtual_control.shape == (40, 3)
+
+
+@pytest.mark.parametrize("drag_1_s", [0.0, 0.5])
+@pytest.mark.parametrize("climb_m_s", [3.0, -2.0])
+def test_behind_a_shorter_horizon_of_z_the_vehicle_brakes_by_the_inputs_of_the_plan(
+    climb_m_s: float, drag_1_s: float
+) -> None:
+    """Its path, which others keep clear of and which is certified, does not stop dead in height."""
+    vehicle = VehicleModelParams(drag_1_s=drag_1_s, thrust_min_01=0.0)
+    mpc = SwarmMpc(MpcParams(horizon_z=10), builders.controller_setup(vehicle=vehicle))
+    asked = problem((0.0, 0.0, -5.0 * climb_m_s), begin=start(vel=(0.0, 0.0, -climb_m_s)), wind=(0.0, 0.0, 0.4))
+    plan, flown = mpc.plan(asked), ModelledVehicle(asked.start, vehicle, asked.disturbance_ned_m_s2)
+    for k in range(40):
+        flown.step(plan.virtual_control[k], 0.02)
+    assert plan.pos_ned_m[-1, 2] == pytest.approx(flown.pos_ned_m[2], abs=0.03)
+    assert plan.vel_ned_m_s[-1, 2] == pytest.approx(flown.vel_ned_m_s[2], abs=0.03)
+    assert np.abs(np.diff(plan.vel_ned_m_s[:, 2])).max() < 0.21, "it does not stop dead"
+    assert abs(plan.vel_ned_m_s[-1, 2]) < abs(plan.vel_ned_m_s[10, 2])
+
+
+def test_a_peer_in_the_way_up_is_seen_behind_a_shorter_horizon_of_z() -> None:
+    above = fixed(HERE + np.array([0.0, 0.0, -2.2]))
+    asked = problem((0.0, 0.0, -6.0), above, begin=start(vel=(0.0, 0.0, -3.0)))
+    plans = [SwarmMpc(MpcParams(horizon_z=n), builders.controller_setup()).plan(asked) for n in (40, 10)]
+    assert [plan.status for plan in plans] == [PlanStatus.NOT_CERTIFIED] * 2
 
 
 def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_does_not() -> None:
