@@ -146,6 +146,7 @@ def _first(found: Sequence[str], others: str) -> Iterator[str]:
 def _judged_by_more_than_is_kept(config: Config) -> Iterator[str]:
     """Yield that commitments keep less from vehicles, or from obstacles, than the flight is judged by."""
     if config.separation.mode != "guaranteed":
+        yield from _first(list(_certified_inside(config)), "obstacles are certified to be flown into")
         return
     budget, limit_m = config.separation.budget, config.limits.min_separation_m
     if budget.committed_m < limit_m - _SAME_M:
@@ -154,6 +155,17 @@ def _judged_by_more_than_is_kept(config: Config) -> Iterator[str]:
         enough_m = math.ceil(100.0 * budget.radius_that_commits_m(limit_m) - 1e-6) / 100.0
         yield f"{keeps}, and {fails}; {enough_m:.2f} m keeps that"
     yield from _first(list(_obstacles_judged_by_more(config.rules(), budget)), "obstacles are judged by more")
+
+
+def _certified_inside(config: Config) -> Iterator[str]:
+    """Yield the obstacles whose keep-outs, less the slack of certificates, begin inside of them."""
+    slack_m, budget = config.separation.certify_slack_m, config.separation.budget
+    for number, obstacle in enumerate(config.obstacles):
+        kept_m = budget.certified_obstacle_m(obstacle.keep_out_m)
+        if kept_m < obstacle.radius_m - _SAME_M:
+            keeps = f"obstacles.{number}.keep_out_m = {obstacle.keep_out_m:g}: plans down to {kept_m:.2f} m are flown"
+            inside = f"which is inside of it (radius_m = {obstacle.radius_m:g})"
+            yield f"{keeps}, {inside}; {obstacle.radius_m + slack_m:g} m keeps them out"
 
 
 def _obstacles_judged_by_more(rules: Rules, budget: SeparationBudget) -> Iterator[str]:

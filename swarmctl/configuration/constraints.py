@@ -29,6 +29,7 @@ from swarmctl.mavlink.transport import Endpoint, parse_url
 _PAIRS_SHOWN = 3
 _ANY_URL = "udpin://127.0.0.1:1"  # in place of one that is missing or no text, which is said elsewhere
 _SAME_TICK = 1e-3  # share by which two times between ticks may differ
+_TINY_M = 1e-9
 _HEARTBEATS = 4  # within the time after which a peer counts as silent: three may be missed in succession
 _LEAST_FAR_COMMITTED_HZ = 2.0  # a round trip, one message of it lost, lasts less than a lease
 _LEAST_FAR_HZ = 0.5  # two seconds, in which two vehicles may have come ten metres closer
@@ -88,6 +89,13 @@ def separation_problems(
     """Yield which distances do not suffice, or can't be known."""
     if agents > 1 and (problem := radius_problem(separation, 0.0, drift_m)):
         yield problem
+    hard_min_m, touch_m = separation.budget.hard_min_distance_m, separation.body_m
+    if agents > 1 and hard_min_m < touch_m - _TINY_M and not separation.allow_small_radius:
+        yield (
+            f"separation.certify_slack_m = {separation.certify_slack_m:g}: plans down to {hard_min_m:.2f} m are flown "
+            f"with separation.radius_m = {separation.radius_m:g}; bodies touch at separation.body_m = {touch_m:g}. "
+            "Lower it, raise the radius, or set separation.allow_small_radius = true"
+        )
     if separation.gust_m_s and not model.drag_1_s:
         yield (
             f"separation.gust_m_s = {separation.gust_m_s:g}: what a gust does to a vehicle follows from its "

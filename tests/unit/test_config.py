@@ -328,6 +328,27 @@ def test_duplicate_sysid_wrong_url_and_missing_vehicle_are_named(tmp_path: Path)
     assert any("70000" in p for p in refusals(vehicles(tmp_path, "udpin://127.0.0.1:70000", "udpin://127.0.0.1:1")))
 
 
+SLACK = ("mission.kind=hover", "limits.min_separation_m=0.5")
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("separation.certify_slack_m=5",),
+        ("separation.certify_slack_m=0.5",),
+        ("separation.radius_m=0.5",),
+        ("separation.body_m=0.85",),
+    ],
+)
+def test_certificates_that_let_bodies_touch_are_refused(given: tuple[str, ...]) -> None:
+    said = r"separation.certify_slack_m = .*: plans down to -?[0-9.]* m are flown .* Lower it"
+    with pytest.raises(ConfigError, match=said):
+        load(None, [*SLACK, *given])
+    for knowingly in ("separation.allow_small_radius=true", "swarm.agents=1"):
+        load(None, [*SLACK, *given, knowingly])
+    load(None, [*SLACK, "separation.certify_slack_m=0.42"])
+
+
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [

@@ -110,6 +110,14 @@ def test_goals_that_two_agents_can_not_both_be_at_are_named(mission: str, at_m: 
     assert found == ([near] if at_m < 0.9 else [])
 
 
+def test_obstacles_whose_certificates_begin_inside_of_them_are_named() -> None:
+    ball = "obstacles=[{center_ned_m=[20,20,-1],radius_m=1,keep_out_m=1.05}]"
+    (said,) = lines(ball)
+    assert said.startswith("obstacles.0.keep_out_m = 1.05: plans down to 0.95 m are flown, which is inside of it")
+    assert said.endswith("(radius_m = 1); 1.1 m keeps them out")
+    assert lines(ball.replace("1.05", "1.1")) == lines(ball, "separation.certify_slack_m=0.05") == []
+
+
 def test_starts_that_only_heights_keep_apart_are_named() -> None:
     hover = ("swarm.agents=2", "mission.kind=hover", "start.positions_ned_m=[[0,0,-1],[0.7,0,-4]]")
     (said,) = lines(*hover)
