@@ -48,7 +48,7 @@ class StateFilter:
 
     Args:
         params: noise model.
-        disturbance: limits and the hover thrust's time constant, shared with the observer.
+        disturbance: limits and the hover thrust's time constant, shared with the observer; whether to estimate at all.
         model: drag, dead time and first guess of the hover thrust.
 
     Attributes:
@@ -56,7 +56,7 @@ class StateFilter:
     """
 
     def __init__(self, params: StateFilterParams, disturbance: DisturbanceParams, model: VehicleModelParams) -> None:
-        self._params, self._limit_m_s2 = params, disturbance.limit_m_s2
+        self._params, self._limit_m_s2, self._learns = params, disturbance.limit_m_s2, disturbance.enabled
         self._drag_1_s, self._delay_us = model.drag_1_s, round(model.delay_s * 1e6)
         self._hover = HoverThrust(model.hover_thrust_01, disturbance.hover_time_s)
         self._thrusts: deque[tuple[int, float]] = deque(maxlen=256)  # time it was sent, thrust 0..1
@@ -69,28 +69,31 @@ class StateFilter:
         """Begin to estimate the disturbance: from now on the acting thrust is known."""
         self._mean[_DIST] = 0.0
         self._covariance[_DIST] = self._covariance[:, _DIST] = 0.0
-        self._covariance[_DIST, _DIST] = _FIRST_M_S2**2
+        if self._learns:
+            self._covariance[_DIST, _DIST] = _FIRST_M_S2**2
         self._thrusts.clear()
         self.estimate = self._estimated()
 
     def learn_hover(self, thrust_01: float) -> None:
         """Move the hover thrust towards the autopilot's own, see `HoverThrust.learn`."""
-        self._hover.learn(thrust_01)
+        if self._learns:
+            self._hover.learn(thrust_01)
         self.estimate = self._estimated()
 
     def update(self, state: VehicleState, thrust_01: float | None) -> Estimate:
         """Update with one new sample; `thrust_01` is the setpoint being sent, None while the autopilot flies."""
         if thrust_01 is not None:
             self._thrusts.append((state.t_us, thrust_01))
-        if self._t_us is None or not 0 < state.t_us - self._t_us < _STALE_US or self._jumped(state):
+        since_us = 0 if self._t_us is None else state.t_us - self._t_us
+        dt_s = since_us * 1e-6
+        if not 0 < since_us < _STALE_US or self._jumped(state, dt_s):
             self._begin(state)
             return self.estimate
-        dt_s = (state.t_us - self._t_us) * 1e-6
         self._t_us = state.t_us
         acted_01 = None if thrust_01 is None else self._acting(state.t_us, thrust_01)
         self._predict(state, acted_01, dt_s)
         self._correct(state)
-        if acted_01 is not None:
+        if acted_01 is not None and self._learns:
             self._mean[_DIST, 2] -= self._hover.explain(float(self._mean[_DIST, 2]), acted_01, dt_s)
             limited = np.minimum(np.maximum(self._mean[_DIST], -self._limit_m_s2), self._limit_m_s2)
             self._mean[_DIST] = limited
@@ -115,8 +118,8 @@ class StateFilter:
         self._covariance = np.diag([p.pos_m**2, velocity, p.bias_m_s**2, spread])
         self._covariance[_VEL, _BIAS] = self._covariance[_BIAS, _VEL] = -(p.bias_m_s**2)
 
-    def _jumped(self, state: VehicleState) -> bool:
-        off = state.pos_ned_m - self._mean[_POS]
+    def _jumped(self, state: VehicleState, dt_s: float) -> bool:
+        off = state.pos_ned_m - (self._mean[_POS] + dt_s * self._mean[_VEL])
         return float(off @ off) > self._params.jump_m**2
 
     def _acting(self, t_us: int, newest_01: float) -> float:
@@ -131,7 +134,7 @@ class StateFilter:
 
     def _predict(self, state: VehicleState, thrust_01: float | None, dt_s: float) -> None:
         p, noise_m_s2 = self._params, self._params.accel_m_s2
-        model, drag_1_s, walk = np.zeros(3), self._drag_1_s, p.disturbance_m_s2
+        model, drag_1_s, walk = np.zeros(3), self._drag_1_s, p.disturbance_m_s2 if self._learns else 0.0
         if thrust_01 is None:
             noise_m_s2, drag_1_s, walk = _UNKNOWN_M_S2, 0.0, 0.0
         else:

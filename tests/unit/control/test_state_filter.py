@@ -21,9 +21,9 @@ STEP_US = 20_000
 STEP_S = STEP_US * 1e-6
 
 
-def make(**params: Any) -> StateFilter:
+def make(disturbance: DisturbanceParams | None = None, **params: Any) -> StateFilter:
     model = VehicleModelParams(delay_s=0.0, drag_1_s=1.0, hover_thrust_01=HOVER_01)
-    return StateFilter(StateFilterParams(enabled=True, **params), DisturbanceParams(), model)
+    return StateFilter(StateFilterParams(enabled=True, **params), disturbance or DisturbanceParams(), model)
 
 
 def sample(t_us: int, pos: Array, vel: Array, q_nb: Array | None = None) -> VehicleState:
@@ -155,3 +155,33 @@ def test_thrust_acts_after_the_dead_time() -> None:
             vel[2] += STEP_S * accel
         worst[name] = float(np.sqrt(np.mean(np.square(found[50:]))))
     assert worst["modelled"] < 0.5 * worst["ignored"]
+
+
+@pytest.mark.parametrize("controls", [True, False])
+def test_a_fast_vehicle_whose_states_are_rare_does_not_jump(controls: bool) -> None:
+    """At 11 m/s it moves by more than `jump_m` between two states of 10 Hz."""
+    filtered, vel, bias, errors_m_s = make(bias_m_s=0.3), np.array([11.0, 0.0, 0.0]), np.array([0.3, 0.3, 0.0]), []
+    lean = quat_from_body_z(np.array([-11.0, 0.0, 9.81]) / math.hypot(11.0, 9.81), 0.0)
+    thrust_01 = HOVER_01 * math.hypot(11.0, 9.81) / 9.81 if controls else None
+    for k in range(200):
+        reported = sample(k * 100_000, 0.1 * k * vel, vel + bias, lean)
+        filtered.update(reported, thrust_01)
+        errors_m_s.append(float(np.linalg.norm(filtered.state(reported).vel_ned_m_s - vel)))
+    assert max(errors_m_s[100:]) < 0.1, "its bias of 0.42 m/s is known"
+    jumped = sample(200 * 100_000, 20.0 * vel + [0.0, 1.5, 0.0], vel + bias, lean)
+    filtered.update(jumped, thrust_01)
+    np.testing.assert_allclose(filtered.state(jumped).pos_ned_m, jumped.pos_ned_m, err_msg="what jumps is believed")
+
+
+def test_where_nothing_is_to_be_estimated_the_model_is_taken_as_it_is() -> None:
+    off, on = make(DisturbanceParams(enabled=False)), make()
+    for found in (off, on):
+        found.reset()
+        for k in range(100):
+            t_s = k * STEP_S
+            pos, vel = np.array([t_s * t_s, 0.0, 0.5 * t_s * t_s]), np.array([2.0 * t_s, 0.0, t_s])
+            found.update(sample(k * STEP_US, pos, vel), HOVER_01)
+        found.learn_hover(0.6)
+    np.testing.assert_array_equal(off.estimate.disturbance_ned_m_s2, 0.0)
+    assert off.estimate.hover_thrust_01 == HOVER_01
+    assert on.estimate.disturbance_ned_m_s2[0] > 1.0 and on.estimate.hover_thrust_01 > HOVER_01
