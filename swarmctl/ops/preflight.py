@@ -16,7 +16,7 @@ from swarmctl.config import Config
 from swarmctl.errors import StartError
 from swarmctl.mavlink.serial_devices import serial_problem
 from swarmctl.mavlink.transport import bind_udp, parse_url
-from swarmctl.telemetry.view.view_ports import PORTS_TRIED, free_view_ports
+from swarmctl.telemetry.view.view_ports import PORTS_TRIED, held_view_port
 
 LOOPBACK = "127.0.0.1"
 _NEEDED = {
@@ -64,7 +64,7 @@ def inspect(config: Config, agents: Sequence[int]) -> ReservedPorts:
             problems.append(str(error))
     else:
         problems += _vehicle_problems(config, agents)
-    view_port = next(free_view_ports(config.telemetry.port), 0) if config.telemetry.enabled else 0
+    view_port = _view_port(config.telemetry.port) if config.telemetry.enabled else 0
     if config.telemetry.enabled and not view_port:
         problems.append(
             f"telemetry.port = {config.telemetry.port}: it and the {PORTS_TRIED - 1} after it are taken; "
@@ -102,6 +102,12 @@ def _package_problems(config: Config) -> Iterator[str]:
         numbers = tuple(int(part) for part in re.findall(r"\d+", found)[: len(least)])
         if numbers < least:
             yield f"package {name} = {found}: too old; pip install '{name}>={wanted}'"
+
+
+def _view_port(first: int) -> int:
+    """Return a port that is free now, and which no viewer is about to bind; the viewer looks again."""
+    with held_view_port(first) as port:
+        return port
 
 
 def _vehicle_problems(config: Config, agents: Sequence[int]) -> Iterator[str]:

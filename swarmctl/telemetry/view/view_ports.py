@@ -10,20 +10,17 @@ HOST = "127.0.0.1"
 PORTS_TRIED = 50
 
 
-def free_view_ports(first: int) -> Iterator[int]:
-    """Yield the ports without a listener among the `PORTS_TRIED` from `first` on."""
-    return (port for port in _from(first) if _is_free(port))
-
-
 @contextmanager
-def held_view_port(first: int) -> Iterator[int]:
-    """Hold a port without a listener, from `first` on, that nobody else holds until the block ends; 0: there is none.
+def held_view_port(first: int, count: int = PORTS_TRIED) -> Iterator[int]:
+    """Hold one of `count` ports from `first` on without a listener that nobody else holds; 0: there is none.
+
+    It is held until the block ends.
 
     Who is to listen on it is another process, which binds it later: two that only look would both find the same port.
     What is bound here is the UDP port of the same number. The system gives it to one process, and frees it however
     that ends. It comes first, as looking binds the TCP port for a moment, in which its holder's server may want it.
     """
-    for port in _from(first):
+    for port in range(first, min(first + count, 65536)):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as claim:
             try:
                 claim.bind((HOST, port))
@@ -34,10 +31,6 @@ def held_view_port(first: int) -> Iterator[int]:
             yield port
             return
     yield 0
-
-
-def _from(first: int) -> range:
-    return range(first, min(first + PORTS_TRIED, 65536))
 
 
 def _is_free(port: int) -> bool:

@@ -28,7 +28,7 @@ from swarmctl.process_priority import give_way
 from swarmctl.telemetry.recording.file_names import RECORDING
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 from swarmctl.telemetry.view.recordings import APPLICATION, has_display, open_viewer
-from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_ports
+from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, held_view_port
 from swarmctl.wall_clock import WallClock
 
 URL_FILE = "viewer.url"
@@ -187,11 +187,16 @@ def _serve(run: str, directory: Path, port: int, history_mb: int) -> tuple[Any, 
     rec.set_log_time_enabled(False)
     path = directory / RECORDING
     writable = _takes_data(path)
-    for candidate in free_view_ports(port):
-        server = rr.GrpcServerSink(HOST, candidate, server_memory_limit=f"{history_mb}MB", newest_first=True)
-        rec.set_sinks(server, *([rr.FileSink(str(path), write_footer=False)] if writable else []))
-        if _is_ours(candidate):
-            return rec, f"rerun+http://{HOST}:{candidate}/proxy"
+    begins, ends = port, port + PORTS_TRIED
+    while begins < ends:
+        with held_view_port(begins, ends - begins) as candidate:  # or a viewer that looks might bind it meanwhile
+            if not candidate:
+                break
+            server = rr.GrpcServerSink(HOST, candidate, server_memory_limit=f"{history_mb}MB", newest_first=True)
+            rec.set_sinks(server, *([rr.FileSink(str(path), write_footer=False)] if writable else []))
+            if _is_ours(candidate):
+                return rec, f"rerun+http://{HOST}:{candidate}/proxy"
+        begins = candidate + 1
     raise StartError(f"no free port in {port}..{port + PORTS_TRIED - 1} on {HOST}. Set telemetry.port")
 
 

@@ -7,6 +7,7 @@ import io
 import json
 import signal
 import socket
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,7 @@ def test_every_problem_at_once_and_nothing_kept(monkeypatch: pytest.MonkeyPatch)
         return found
 
     monkeypatch.setattr(importlib.metadata, "version", version)
-    monkeypatch.setattr(preflight, "free_view_ports", lambda _: iter(()))
+    monkeypatch.setattr(preflight, "held_view_port", lambda _: nullcontext(0))
     with pytest.raises(StartError) as caught:
         preflight.inspect(load(None, ["telemetry.port=9876"]), range(3))
     lines = str(caught.value).splitlines()

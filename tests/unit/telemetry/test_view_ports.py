@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import socket
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
+import rerun as rr
 
-from swarmctl.telemetry.view import view_ports
-from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_ports, held_view_port
+from swarmctl.telemetry.view import view_ports, viewer
+from swarmctl.telemetry.view.view_ports import HOST, held_view_port
 
 FIRST = 19_090
 
@@ -16,7 +18,7 @@ FIRST = 19_090
 def test_a_port_that_is_held_is_nobody_elses_until_it_is_given_back() -> None:
     with held_view_port(FIRST) as one, held_view_port(FIRST) as other:
         assert FIRST <= one < other
-        assert next(free_view_ports(FIRST)) == one, "nothing listens on it yet: who only looks finds it again"
+        assert view_ports._is_free(one), "nothing listens on it yet: who only looks finds it again"
     with held_view_port(FIRST) as again:
         assert again == one
 
@@ -47,4 +49,25 @@ def test_no_port_is_said_as_zero() -> None:
     with ExitStack() as held:
         found = [held.enter_context(held_view_port(65_536 - 3)) for _ in range(4)]
         assert found[-1] == 0 and len({*found}) > 1
-    assert len([*free_view_ports(65_536 - 3)]) <= 3 < PORTS_TRIED
+
+
+def test_a_viewer_serves_on_no_port_that_another_one_is_about_to_bind(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Both found the same port free, and who lost it waited 2 s before it tried the next."""
+    served, seen = list[int](), list[int]()
+
+    def serve(host: str, port: int, **_: object) -> object:
+        served.append(port)
+        with held_view_port(port) as other:
+            seen.append(other)
+        return rr.FileSink(str(tmp_path / "sunk.rrd"))
+
+    monkeypatch.setattr(rr, "GrpcServerSink", serve)
+    monkeypatch.setattr(viewer, "_is_ours", lambda port: port != served[0])
+    with held_view_port(FIRST) as held:
+        rec, url = viewer._serve("run", tmp_path, held, 16)
+        rec.disconnect()
+    assert held < served[0] < served[1]
+    assert url.endswith(f":{served[1]}/proxy")
+    assert all(other > port for port, other in zip(served, seen, strict=True)), "it holds its own meanwhile"
