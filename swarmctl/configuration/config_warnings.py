@@ -11,6 +11,7 @@ import numpy as np
 from swarmctl.config import Config
 from swarmctl.configuration.constraints import is_tick
 from swarmctl.control.collision.budget import SeparationBudget
+from swarmctl.control.phases.trajectories import way_home
 from swarmctl.control.reference.kinds.csv_table import CsvParams
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.goal import REACHED_M
@@ -33,11 +34,7 @@ def config_warnings(config: Config) -> list[str]:
     kind = config.mission.kind
     found = [f"mission.{name} is set, mission.kind is {kind!r}: it is not flown" for name in unused]
     references = config.mission.references(np.array(config.starts_ned_m()), config.separation.budget.planned_m)
-    flown = [
-        text
-        for about in (_begin_elsewhere, _cut_short, _same_goals, _left_behind, _seen_too_late)
-        for text in about(config, references)
-    ]
+    flown = [text for about in _ABOUT_REFERENCES for text in about(config, references)]
     judged = (*_judged_by_more_than_is_kept(config), *_stand_above_each_other(config))
     return [*found, *flown, *judged, *_turned_by_steep_tilt(config), *_counts_by_other_ticks(config)]
 
@@ -106,6 +103,25 @@ def _same_goals(config: Config, references: Sequence[MissionReference]) -> Itera
         if away_m < apart_m - _SAME_M:
             found.append(f"the goals of agents {i} and {j} are {away_m:.2f} m apart; separation.radius_m = {apart_m:g}")
     yield from _first([f"{text}: not both arrive" for text in found], "pairs of goals are as near")
+
+
+def _swings_out(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
+    """Yield whose way home leaves the fence: a mission that ends fast carries a vehicle beyond its end."""
+    found, fence, params = [], config.geofence.area(), config.agent.state_machine
+    if fence is None:
+        return
+    for agent, (reference, start) in enumerate(zip(references, np.array(config.starts_ned_m()), strict=True)):
+        pos, vel = reference.sample(np.array([config.mission.duration_s]))
+        brake_m_s2 = min(config.separation.brake_m_s2, config.controller.mpc.accel_max_m_s2(config.model_of(agent)))
+        limits = {"speed_m_s": params.speed_m_s, "accel_m_s2": params.accel_m_s2, "brake_m_s2": brake_m_s2}
+        way = way_home(pos[0], vel[0], start, **limits)
+        beyond_m = float(fence.beyond_m(way.sample(np.linspace(0.0, way.travel_s, _SAMPLES))[0][:, :2]).max())
+        if beyond_m > _SAME_M:
+            leads = f"agent {agent}: after the mission, at {np.linalg.norm(vel[0]):.1f} m/s, its way home leads"
+            found.append(
+                f"{leads} {beyond_m:.1f} m outside of geofence.corners_ne_m; end it slower, or move the corners"
+            )
+    yield from _first(found, "ways home lead out of the fence")
 
 
 def _left_behind(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
@@ -220,6 +236,9 @@ def _seen_too_late(config: Config, references: Sequence[MissionReference]) -> It
                 )
                 yield f"{seen}, at {speed_m_s:.1f} m/s, {stops}; raise visibility_m"
                 break
+
+
+_ABOUT_REFERENCES = (_begin_elsewhere, _cut_short, _same_goals, _swings_out, _left_behind, _seen_too_late)
 
 
 def _turned_by_steep_tilt(config: Config) -> Iterator[str]:

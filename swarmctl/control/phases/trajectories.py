@@ -174,17 +174,9 @@ class Trajectories:
         )
 
     def _decelerations_m_s2(self, vel_ned_m_s: Array, of_brake: float) -> tuple[float, float]:
-        """Return the least and the most deceleration at which a first velocity (3,) is shed, or braked to rest.
-
-        The least is that of transits; what is faster than they are is lost as fast as peers expect. A mission at
-        7.5 m/s would else lead 40 m beyond its end.
-        """
+        """Return the least and the most deceleration at which a first velocity (3,) is shed, or braked to rest."""
         hard_m_s2 = max(self._accel_m_s2, of_brake * self._brake_m_s2)
-        speed_m_s = math.sqrt(float(vel_ned_m_s @ vel_ned_m_s))
-        fast_m_s = speed_m_s - self._speed_m_s
-        if fast_m_s <= 0.0:
-            return self._accel_m_s2, hard_m_s2
-        return speed_m_s / (self._speed_m_s / self._accel_m_s2 + fast_m_s / hard_m_s2), hard_m_s2
+        return _gentle_m_s2(vel_ned_m_s, self._speed_m_s, self._accel_m_s2, hard_m_s2), hard_m_s2
 
     def _lowest_m(self, state: VehicleState) -> float:
         """Return the down coordinate to which a vehicle may be carried; one that is lower already, where it is."""
@@ -220,6 +212,30 @@ class Trajectories:
 
     def _begin(self, trajectory: QuinticTrajectory, now_us: int) -> None:
         self.current = BegunTrajectory(trajectory=trajectory, began_us=now_us)
+
+
+def way_home(
+    pos_ned_m: Array, vel_ned_m_s: Array, home_ned_m: Array, *, speed_m_s: float, accel_m_s2: float, brake_m_s2: float
+) -> QuinticTrajectory:
+    """Return the way home from a place and velocity (3,), of a vehicle that the ground does not have to be kept from.
+
+    Args:
+        pos_ned_m, vel_ned_m_s, home_ned_m: where it begins, and ends.
+        speed_m_s, accel_m_s2, brake_m_s2: as of `Trajectories`.
+    """
+    hard_m_s2 = max(accel_m_s2, _OF_SHEDDING * brake_m_s2)
+    shed_s = shedding_s(vel_ned_m_s, _gentle_m_s2(vel_ned_m_s, speed_m_s, accel_m_s2, hard_m_s2))
+    return quintic_to(pos_ned_m, vel_ned_m_s, home_ned_m, speed_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
+
+
+def _gentle_m_s2(vel_ned_m_s: Array, speed_m_s: float, accel_m_s2: float, hard_m_s2: float) -> float:
+    """Return the mean deceleration of a velocity (3,): that of transits up to their speed, a hard one above it.
+
+    A mission at 7.5 m/s would else lead 40 m beyond its end.
+    """
+    first_m_s = math.sqrt(float(vel_ned_m_s @ vel_ned_m_s))
+    fast_m_s = first_m_s - speed_m_s
+    return accel_m_s2 if fast_m_s <= 0.0 else first_m_s / (speed_m_s / accel_m_s2 + fast_m_s / hard_m_s2)
 
 
 def is_at(state: VehicleState, target_ned_m: Array, within_m: float, slower_m_s: float) -> bool:

@@ -93,6 +93,15 @@ def test_a_swap_that_is_cut_short_is_named() -> None:
     assert lines(*swap, "mission.duration_s=20") == []
 
 
+@pytest.mark.parametrize(("corner_m", "outside"), [(11, True), (25, False)])
+def test_a_way_home_that_leaves_the_fence_is_named(corner_m: int, outside: bool) -> None:
+    """On the circle of 5 m it ends at 7.5 m/s."""
+    corners = [[-corner_m, -corner_m], [corner_m, -corner_m], [corner_m, corner_m], [-corner_m, corner_m]]
+    fast = load(ROOT / "configs" / "x500_fast_circle.toml", [f"geofence.corners_ne_m={corners}"])
+    (said,) = config_warnings(fast) or [""]
+    assert ("agent 0: after the mission, at 7.5 m/s, its way home leads " in said) is outside
+
+
 @pytest.mark.parametrize(
     ("mission", "at_m"),
     [
