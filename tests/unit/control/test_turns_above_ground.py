@@ -67,8 +67,15 @@ def test_a_stop_that_is_too_late_is_bounded(sinks_m_s: float, at_m: float) -> No
     )
     assert flown.current is not None
     trajectory = flown.current.trajectory
-    assert trajectory.to_ned_m[2] <= max(-LEAST_M, at_m)
+    assert trajectory.to_ned_m[2] <= max(-LEAST_M, at_m + 0.1)
     assert trajectory.travel_s == pytest.approx(max(0.5, np.hypot(1.0, sinks_m_s) / BRAKE_M_S2))
+
+
+def test_who_flies_low_and_sways_stops_as_gently_as_any() -> None:
+    flown = trajectories(sinking(2.0, 2.0))
+    flown.stop(0, builders.vehicle_state(pos_ned_m=np.array([0.0, 0.0, -0.4]), vel_ned_m_s=np.array([2.0, 0.0, 0.03])))
+    assert flown.current is not None
+    assert flown.current.trajectory.travel_s == pytest.approx(2.0 * 2.0 / ACCEL_M_S2, rel=1e-3)
 
 
 def test_a_stop_that_has_room_is_as_gentle_as_without_a_ground() -> None:
