@@ -19,6 +19,7 @@ from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned, rotate_to_ned
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, VehicleState
 
+_REMEMBERED = 512  # commands: more than the longest dead time holds at the highest rate, with a state that is late
 _NOTICE_S = 0.17  # until a change of the wind is known by its effect, and tilt grows against it
 
 
@@ -99,7 +100,9 @@ class Predictor:
     def __init__(self, params: VehicleModelParams) -> None:
         self._delay_us = round(params.delay_s * 1e6)
         self._lag, self._drag_1_s = params.lag(), params.drag_1_s
-        self._sent: deque[tuple[int, Array]] = deque(maxlen=128)  # time from which it acts, virtual controls (3,)
+        self._sent: deque[tuple[int, Array]] = deque(
+            maxlen=_REMEMBERED
+        )  # time from which it acts, virtual controls (3,)
 
     @property
     def delay_us(self) -> int:

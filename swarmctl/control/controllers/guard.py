@@ -92,9 +92,9 @@ class Guard:
         if failure or self._suspended:
             return self._instead(problem, self._suspended or failure)
         plan = self._moved(problem, commands, took_s)
-        if problem.keep_outs and self._clearance_m(plan, problem.keep_outs) < 0.0:
+        if problem.keep_outs and not self._clearance_m(plan, problem.keep_outs) >= 0.0:  # nor where it is no number
             return self._instead(problem, "plans too close to a peer or an obstacle")
-        if volume_margin_m(self._setup.volume, plan.pos_ned_m, plan.vel_ned_m_s, 1) < 0.0:
+        if not volume_margin_m(self._setup.volume, plan.pos_ned_m, plan.vel_ned_m_s, 1) >= 0.0:
             return self._instead(problem, "plans to leave the flight volume")
         if self._sinks_too_low(plan, problem):
             return self._instead(problem, "plans to fly into the ground")
@@ -183,7 +183,7 @@ class Guard:
         tail_s = np.linspace(0.0, max(dt_s, stop_s), _TAIL_POINTS)
         path = plan.pos_ned_m[-1] + braking_displacement(plan.vel_ned_m_s[-1], tail_s, separation.brake_m_s2)
         behind = [_braking(keep_out, tail_s, dt_s, separation) for keep_out in keep_outs]
-        return min(certify(plan.pos_ned_m, keep_outs, 1), certify(path, behind, 1))
+        return float(np.minimum(certify(plan.pos_ned_m, keep_outs, 1), certify(path, behind, 1)))
 
 
 class _Chatter:

@@ -68,7 +68,7 @@ def _certified(
     problem: Problem, pos_ned_m: Array, vel_ned_m_s: Array, from_step: int, volume: FlightVolume | None
 ) -> PlanStatus:
     """Return whether a solved plan keeps its true distances, and stays in the volume."""
-    if certify(pos_ned_m, problem.keep_outs, from_step) < 0.0:
+    if not certify(pos_ned_m, problem.keep_outs, from_step) >= 0.0:  # nor where it is no number
         return PlanStatus.NOT_CERTIFIED
-    leaves = volume_margin_m(volume, pos_ned_m, vel_ned_m_s, from_step) < 0.0
-    return PlanStatus.NOT_CERTIFIED if leaves else PlanStatus.OK
+    stays = volume_margin_m(volume, pos_ned_m, vel_ned_m_s, from_step) >= 0.0
+    return PlanStatus.OK if stays else PlanStatus.NOT_CERTIFIED

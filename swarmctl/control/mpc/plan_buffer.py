@@ -66,7 +66,7 @@ class PlanBuffer:
         """Return the smallest margin [m] of a plan of ours that was refused for its distances alone, else -inf."""
         if not self._takes_refused or plan.by_own or plan.status is not PlanStatus.NOT_CERTIFIED:
             return -math.inf
-        if volume_margin_m(self._volume, plan.pos_ned_m, plan.vel_ned_m_s, 0) < 0.0:
+        if not volume_margin_m(self._volume, plan.pos_ned_m, plan.vel_ned_m_s, 0) >= 0.0:
             return -math.inf
         return certify(plan.pos_ned_m, keep_outs, 0)
 

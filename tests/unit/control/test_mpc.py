@@ -189,6 +189,13 @@ def test_a_keep_out_beyond_the_slots_is_still_certified() -> None:
     assert plan.status is PlanStatus.NOT_CERTIFIED
 
 
+def test_no_plan_is_certified_beside_a_keep_out_without_a_place() -> None:
+    nowhere = fixed(np.full(3, math.nan))
+    away = [fixed(HERE + np.array([20.0 + k, 0.0, 0.0])) for k in range(3)]  # they take the slots
+    assert plan_to((0.1, 0.0, 0.0), *away).status is PlanStatus.OK
+    assert plan_to((0.1, 0.0, 0.0), *away, nowhere).status is PlanStatus.NOT_CERTIFIED
+
+
 def test_a_solver_that_breaks_down_is_a_status_and_not_an_exception() -> None:
     for bad in (math.nan, math.inf):
         plan = plan_to((1.0, 0.0, 0.0), begin=start(vel=(bad, 0.0, 0.0)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import itertools
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -112,6 +113,13 @@ def test_what_is_no_command_is_replaced_and_after_half_a_second_not_asked_for(an
     assert controller.plan(hover(controller)).suspended, "it is not asked any more"
     controller.reset()
     assert controller.plan(hover(controller)).suspended, "nor after a handover"
+
+
+def test_beside_a_keep_out_without_a_place_nothing_of_its_own_is_flown() -> None:
+    controller = guarded(level)
+    plan = controller.plan(hover(controller, (9.0, 0.0, 0.0), (0.0, 9.0, 0.0), (math.nan, 0.0, 0.0)))
+    assert plan.failure.endswith("plans too close to a peer or an obstacle")
+    assert plan.status is not PlanStatus.OK, "nor of the fallback"
 
 
 def test_a_late_controller_is_suspended_and_a_punctual_one_is_not() -> None:

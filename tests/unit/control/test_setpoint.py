@@ -111,6 +111,16 @@ def predicted(predictor: Predictor, now: VehicleState, until_us: int, wind: Arra
     return start.pos_ned_m, start.vel_ned_m_s
 
 
+def test_all_commands_of_the_longest_dead_time_are_remembered_at_the_highest_rate() -> None:
+    predictor, tick_us = Predictor(VehicleModelParams(delay_s=1.0)), 5_000  # 200 Hz
+    for k in range(400):
+        predictor.sent(k * tick_us, np.array([-0.2 if k < 250 else 0.2, 0.0, G]))
+    now_us = 400 * tick_us
+    start = predictor.start(builders.vehicle_state(t_us=now_us), now_us + 1_000_000, np.zeros(3), builders.HOVERING)
+    # to the north for the first quarter of a second, those of before act, then to the south
+    assert start.vel_ned_m_s[0] == pytest.approx(0.2 * G * (0.25 - 0.75), rel=0.02)
+
+
 def test_prediction_applies_each_command_from_when_it_acts() -> None:
     predictor = Predictor(VehicleModelParams(delay_s=0.1))
     north, east = level_and(2.0, 0.0), level_and(0.0, 4.0)
