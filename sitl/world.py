@@ -31,7 +31,7 @@ from swarmctl.mavlink.transport import Transport
 from swarmctl.simulator_config import SimulatorConfig
 
 AUTOPILOT_HZ = 50
-_LINK_PURPOSE, _GCS_LINK_PURPOSE = 3, 4  # purposes of random streams, beside run seed and vehicle
+_LINK_PURPOSE, _GCS_LINK_PURPOSE = 3, 4  # purposes of random streams, beside run seed and vehicle of the swarm
 
 
 @runtime_checkable
@@ -69,11 +69,9 @@ class SitlWorld:
         self._make_plant(spawns_ned_m - self._offset_ned_m)  # local: the spawn is exact, its origin is rounded
         self.autopilots: list[Commander] = []
         self.endpoints: list[MavlinkInterface] = []
-        self._links = [LossyLink(link, (params.seed, i, _LINK_PURPOSE)) for i, link in enumerate(transports)]
+        self._links = self._lossy(transports, _LINK_PURPOSE)
         self.gcs_endpoints: list[MavlinkInterface] = []
-        self._gcs_links = [
-            LossyLink(link, (params.seed, i, _GCS_LINK_PURPOSE)) for i, link in enumerate(gcs_transports)
-        ]
+        self._gcs_links = self._lossy(gcs_transports, _GCS_LINK_PURPOSE)
         self.signing: list[VehicleSigning] = []
         self._keys = keys
         self._kind = AUTOPILOT_KINDS[params.autopilot_kind]
@@ -93,6 +91,10 @@ class SitlWorld:
         self._steps = 0
         self.faults = Faults(self, params.faults, count, params.first_vehicle)
 
+    def _lossy(self, transports: Sequence[Transport], purpose: int) -> list[LossyLink]:
+        seed, first = self.params.seed, self.params.first_vehicle
+        return [LossyLink(link, (seed, first + i, purpose)) for i, link in enumerate(transports)]
+
     def _make_plant(self, spawns_local_ned_m: Array) -> None:
         """Make the vehicles at their spawns (N, 3), and what measures them and keeps their attitude."""
         params, dt_s, airborne = self.params, 1.0 / self.params.physics_hz, self.params.start == "air"
@@ -107,10 +109,17 @@ class SitlWorld:
             ground_effect=params.ground_effect,
         )
         self.plant.held[:] = airborne
-        self.estimator = Estimator(ESTIMATORS[params.estimator], self.plant, params.seed)
+        first = params.first_vehicle
+        self.estimator = Estimator(ESTIMATORS[params.estimator], self.plant, params.seed, first_vehicle=first)
         self.attitude = attitude_loop(preset, params.vehicles, dt_s, params.attitude_gains)
         self.physics = Physics(
-            self.plant, self.attitude, self.estimator, params, seed=params.seed, slow_every=self._autopilot_every
+            self.plant,
+            self.attitude,
+            self.estimator,
+            params,
+            seed=params.seed,
+            first_vehicle=first,
+            slow_every=self._autopilot_every,
         )
         self.imu = Imu(self.plant, self._autopilot_every * dt_s)
 

@@ -157,10 +157,11 @@ class Estimator:
         power: measurements of each vehicle's power module.
     """
 
-    def __init__(self, model: ErrorModel | None, plant: Plant, seed: int) -> None:
+    def __init__(self, model: ErrorModel | None, plant: Plant, seed: int, *, first_vehicle: int = 0) -> None:
         self._model = model
         self._plant = plant
         self._seed = seed
+        self._first_vehicle = first_vehicle  # its number in the swarm, by which each draws its own errors
         self._accuracy_m = model.accuracy_m if model else EXACT_ACCURACY_M
         self._stale = True
         count = plant.state.shape[1]
@@ -174,11 +175,11 @@ class Estimator:
         self._rows: list[Any] = []  # (22,) per vehicle
         self._on_ground: list[bool] = []
         if model is not None:
-            self._start(model, plant, seed)
+            self._start(model, plant)
 
-    def _start(self, model: ErrorModel, plant: Plant, seed: int) -> None:
+    def _start(self, model: ErrorModel, plant: Plant) -> None:
         count, dt_s = plant.state.shape[1], plant.dt_s
-        self._rngs = [np.random.default_rng([seed, i, _PURPOSE]) for i in range(count)]
+        self._rngs = [self._rng(i, _PURPOSE) for i in range(count)]
         rms, taus_s = model.wander
         self._keep = np.exp(-2.0 * dt_s / taus_s)[:, None]  # of each low-pass, with half the correlation time
         self._follow = 1.0 - self._keep
@@ -201,6 +202,9 @@ class Estimator:
         self._tilt_rad = np.zeros((3, count))
         self._believed = np.zeros((_KNOWN_ROWS, count))
         self._tilt_quat()
+
+    def _rng(self, vehicle: int, *purpose: int) -> np.random.Generator:
+        return np.random.default_rng([self._seed, self._first_vehicle + vehicle, *purpose])
 
     def _start_history(self, lag_steps: NDArray[np.int64]) -> None:
         """Fill the ring of the newest samples, (steps, 16, N); `_delayed` finds in it what each vehicle has by now."""
@@ -297,7 +301,7 @@ class Estimator:
     def lose_gps(self, vehicle: int) -> None:
         """Dead-reckon the position from now on: its horizontal error accelerates; height has a barometer."""
         self._wake()
-        heading = np.random.default_rng([self._seed, vehicle, _PURPOSE, 1]).uniform(0.0, 2.0 * math.pi)
+        heading = self._rng(vehicle, _PURPOSE, 1).uniform(0.0, 2.0 * math.pi)
         self._drift_axis[:, vehicle] = math.cos(heading), math.sin(heading), 0.0
         self._lost[vehicle] = 1.0
         self._drift_m[vehicle] = self._drift_m_s[vehicle] = 0.0
@@ -310,7 +314,7 @@ class Estimator:
         self._displaced = True
         if self._model is None:
             self._model = _PERFECT
-            self._start(_PERFECT, self._plant, self._seed)
+            self._start(_PERFECT, self._plant)
 
     # --- what the error models make of the truth ---
 

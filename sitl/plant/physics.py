@@ -34,11 +34,12 @@ class Physics:
         params: SimulatorParams,
         *,
         seed: int,
+        first_vehicle: int,
         slow_every: int,
     ) -> None:
         count = plant.state.shape[1]
         self.plant, self.attitude, self.estimator = plant, attitude, estimator
-        self.air = Air(params.wind, count, slow_every * plant.dt_s, seed)
+        self.air = Air(params.wind, count, slow_every * plant.dt_s, seed, first_vehicle=first_vehicle)
         self.battery = Battery(params.battery, plant.preset, count)
         self.rotor_health_01 = np.ones((4, count))
         self._slow_every = slow_every

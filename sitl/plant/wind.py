@@ -64,9 +64,10 @@ class Air:
         vehicles: number of vehicles.
         dt_s: time between two updates.
         seed: seed of the run.
+        first_vehicle: number of the first vehicle in the swarm, by which each draws its own.
     """
 
-    def __init__(self, params: WindParams, vehicles: int, dt_s: float, seed: int) -> None:
+    def __init__(self, params: WindParams, vehicles: int, dt_s: float, seed: int, *, first_vehicle: int = 0) -> None:
         self.mean_ned_m_s = np.array(params.mean_ned_m_s).reshape(3, 1)
         self._intensity_m_s = params.turbulence_m_s
         self._dt_s = dt_s
@@ -75,7 +76,7 @@ class Air:
         if any(params.gust_ned_m_s):
             peak = np.tile(np.array(params.gust_ned_m_s).reshape(3, 1), vehicles)
             self.gusts.append(Gust(peak_ned_m_s=peak, from_s=params.gust_at_s, for_s=params.gust_for_s))
-        self._rngs = [np.random.default_rng([seed, i, _PURPOSE]) for i in range(vehicles)]
+        self._rngs = [np.random.default_rng([seed, first_vehicle + i, _PURPOSE]) for i in range(vehicles)]
         self._block = np.zeros((0, 5, vehicles))
         self._drawn = 0
         self._eddies = np.zeros((5, vehicles))  # states of the filters of u (1), v (2), w (2), driven to unit variance
