@@ -34,7 +34,7 @@ from sitl.studies.campaign.quick import QUICK
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.store import Store
 from sitl.studies.campaign.summary import summaries
-from sitl.studies.campaign.trials import Cell, Row, Trial, cells, trial_of
+from sitl.studies.campaign.trials import Cell, Row, Trial, cells, trial_of, unflown
 from sitl.studies.campaign.worker_pool import fly_trial, on_cluster, on_this_machine
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, exit_code_of
 
@@ -55,14 +55,16 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     trials = _trials(options)
     began_s = time.monotonic()
-    with Store(options.out, code_id(), options.mix) as store:
+    code = code_id()
+    with Store(options.out, code, options.mix) as store:
         missing = store.missing(trials)
         print(f"{len(trials)} runs, {len(trials) - len(missing)} of them there already; {options.out}", flush=True)
         jobs = min(options.jobs, max(1, len(missing)))
         flown = (
             on_cluster(missing, options.dask, fly_trial) if options.dask else on_this_machine(missing, jobs, fly_trial)
         )
-        count, errors = collect(flown, len(missing), store, noted=("collided", lambda row: bool(row["collided"])))
+        noted = "collided", lambda row: bool(row["collided"])
+        count, errors = collect(flown, len(missing), store, noted=noted, unflown=partial(unflown, code=code))
     hours = (time.monotonic() - began_s) / 3600.0
     report = write_page(options.out, store.rows, count / hours if count else None)
     asked = set(trials)

@@ -60,7 +60,7 @@ def share_text(share: Share) -> str:
 
 
 def _share(share: Share, good_is_all: bool) -> Markup:
-    good = share.hits == (share.trials if good_is_all else 0)
+    good = share.trials > 0 and share.hits == (share.trials if good_is_all else 0)
     low, high = (_BAR_PX * bound for bound in share.interval)
     bar = element(
         "svg",
@@ -104,6 +104,7 @@ _COLUMNS: tuple[_Column, ...] = (
     ("airframe", lambda s: "" if s.cell.airframe == "own" else s.cell.airframe),
     ("disturbance", lambda s: "" if s.cell.disturbance == NONE else s.cell.disturbance),
     ("settings", lambda s: s.cell.sets),
+    ("not flown", lambda s: str(s.not_flown) if s.not_flown else ""),
     ("collided", lambda s: _share(s.collided, False)),
     ("arrived", lambda s: _share(s.arrived, True)),
     ("deadlocked", lambda s: share_text(s.deadlocked) if s.deadlocked.hits else ""),

@@ -23,20 +23,23 @@ def collect(
     store: RowStore[Any],
     *,
     noted: tuple[str, Callable[[Row], bool]],
+    unflown: Callable[[_Job, str], Row],
 ) -> tuple[int, list[str]]:
-    """Add every row to the store; return how many there are, and what could not be flown, in words.
+    """Add every row to the store, those of errors too; return how many were flown, and what was not, in words.
 
     Args:
         flown: jobs with their rows or errors.
         total: number of jobs.
         store: of the rows.
         noted: what rows are counted on the way, in a word, and which.
+        unflown: makes the row of a job that an error ended.
     """
     count, errors = 0, []
     with closing(flown):
         for job, result in _shown(flown, total, *noted):
             if isinstance(result, str):
                 errors.append(f"{job}: {result}")
+                store.add(unflown(job, result))
                 continue
             count += 1
             store.add(result)

@@ -15,7 +15,7 @@ from typing import ClassVar, Generic, Self, TypeVar
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sitl.studies.campaign.trials import SCHEMA, Row, Trial, trial_of
+from sitl.studies.campaign.trials import SCHEMA, Row, Trial, is_flown, trial_of
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replaced
 from swarmctl.telemetry.recording.file_names import STUDY_ROWS
@@ -71,8 +71,9 @@ class RowStore(Generic[_Job]):
                 str(self._path),
                 [f"flown by other sources ({', '.join(others)}; these are {code}): {self.advice}"],
             )
-        self._finished = {job_of(row) for row in self.rows}
-        self._saved_s, self._saved_rows = time.monotonic(), len(self.rows)
+        self._finished = {job_of(row) for row in self.rows if is_flown(row)}
+        self._unflown = {job_of(row) for row in self.rows} - self._finished
+        self._saved_s, self._is_saved = time.monotonic(), True
 
     def __enter__(self) -> Self:
         return self
@@ -83,24 +84,29 @@ class RowStore(Generic[_Job]):
         self.save()
 
     def missing(self, jobs: Iterable[_Job]) -> list[_Job]:
-        """Return the flights not flown yet, in order, each once."""
+        """Return the flights not flown yet, in order, each once; one that an error ended is flown again."""
         return [job for job in dict.fromkeys(jobs) if job not in self._finished]
 
     def add(self, row: Row) -> None:
-        """Add a finished row; it is on disk within a second, or with the next one."""
+        """Add a row, in place of that of an error; it is on disk within a second, or with the next one."""
+        job = self._job_of(row)
+        if job in self._unflown:
+            self.rows = [other for other in self.rows if self._job_of(other) != job]
+            self._unflown.discard(job)
         self.rows.append(row)
-        self._finished.add(self._job_of(row))
+        (self._finished if is_flown(row) else self._unflown).add(job)
+        self._is_saved = False
         if time.monotonic() - self._saved_s >= _SAVE_EVERY_S:
             self.save()
 
     def save(self) -> None:
         """Write all rows, if there are new ones."""
         self._saved_s = time.monotonic()
-        if len(self.rows) == self._saved_rows:
+        if self._is_saved:
             return
         with writing(self._path), replaced(self._path) as file:
             pq.write_table(pa.Table.from_pylist(self.rows, self._schema), file)
-        self._saved_rows = len(self.rows)
+        self._is_saved = True
 
 
 class Store(RowStore[Trial]):

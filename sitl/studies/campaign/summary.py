@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, median
 
-from sitl.studies.campaign.trials import Cell, Row, cell_of
+from sitl.studies.campaign.trials import Cell, Row, cell_of, is_flown
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,16 +37,17 @@ class CellSummary:
     """One line of the report; None where nothing was measured."""
 
     cell: Cell
-    collided: Share
-    arrived: Share
-    deadlocked: Share
+    not_flown: int  # runs that an error ended
+    collided: Share  # of the runs that were flown
+    arrived: Share  # of all runs
+    deadlocked: Share  # of the runs that were flown
     min_separation_m: float | None  # of all runs
     min_clearance_m: float | None
     time_median_s: float | None  # of the runs that arrived
     time_max_s: float | None
     time_relative: float | None  # median of flight time relative to the single-agent time
     sum_relative: float | None  # largest ratio of the sum of goal distances to its theoretical lower bound
-    plans_failed: float  # mean per run
+    plans_failed: float  # mean per run that was flown
     commits_refused: float
     safety_filter_acted: float
     cpu_s: float
@@ -60,14 +61,16 @@ def summaries(rows: Sequence[Row]) -> list[CellSummary]:
     return [_summary(cell, grouped[cell]) for cell in sorted(grouped)]
 
 
-def _summary(cell: Cell, rows: Sequence[Row]) -> CellSummary:
+def _summary(cell: Cell, asked: Sequence[Row]) -> CellSummary:
+    rows = [row for row in asked if is_flown(row)]
     times = [row["flight_time_s"] for row in rows if row["flight_time_s"] is not None]
     ratios = _ratios(rows, "flight_time_s", "unconstrained_time_s")
     sums = _ratios([row for row in rows if row["arrived"]], "goal_sum_m", "least_sum_m")
     return CellSummary(
         cell=cell,
+        not_flown=len(asked) - len(rows),
         collided=_count(rows, "collided"),
-        arrived=_count(rows, "arrived"),
+        arrived=_count(asked, "arrived"),
         deadlocked=_count(rows, "deadlocked"),
         min_separation_m=_least(rows, "min_separation_m"),
         min_clearance_m=_least(rows, "min_clearance_m"),
@@ -75,11 +78,15 @@ def _summary(cell: Cell, rows: Sequence[Row]) -> CellSummary:
         time_max_s=max(times, default=None),
         time_relative=median(ratios) if ratios else None,
         sum_relative=max(sums, default=None),
-        plans_failed=fmean(row["plans_failed"] for row in rows),
-        commits_refused=fmean(row["commits_refused"] or 0 for row in rows),
-        safety_filter_acted=fmean(row["safety_filter_acted"] for row in rows),
-        cpu_s=fmean(row["cpu_s"] for row in rows),
+        plans_failed=_mean(rows, "plans_failed"),
+        commits_refused=_mean(rows, "commits_refused"),
+        safety_filter_acted=_mean(rows, "safety_filter_acted"),
+        cpu_s=_mean(rows, "cpu_s"),
     )
+
+
+def _mean(rows: Sequence[Row], name: str) -> float:
+    return fmean(row[name] or 0 for row in rows) if rows else 0.0
 
 
 def _count(rows: Sequence[Row], name: str) -> Share:

@@ -47,7 +47,7 @@ CELL_FIELDS = (
     "sets",
 )
 
-# One row per run. Lengths and times are null where there is nothing to measure.
+# One row per run. What can't be known is null: of a run that was not flown everything, but that it did not arrive.
 SCHEMA = pa.schema(
     [
         pa.field("scenario", pa.string()),
@@ -66,7 +66,9 @@ SCHEMA = pa.schema(
         pa.field("disturbance", pa.string()),
         pa.field("sets", pa.string()),
         pa.field("deadlocked", pa.bool_()),  # time ran out, and a vehicle that has not arrived stands still
-        pa.field("outcome", pa.string()),  # arrived, collided, deadlocked, late, or what went wrong
+        pa.field(
+            "outcome", pa.string()
+        ),  # arrived, collided, deadlocked, late, what went wrong, or "not flown: " and why
         pa.field("min_clearance_m", pa.float64()),  # smallest true distance of a body's hull to an obstacle's surface
         pa.field("arrived_agents", pa.int32()),
         pa.field("unconstrained_time_s", pa.float64()),  # of the longest way, flown alone
@@ -82,6 +84,24 @@ SCHEMA = pa.schema(
 )
 
 Row = dict[str, Any]
+_NOT_FLOWN = "not flown: "  # begins the outcome of a trial that an error ended
+
+
+def row_of_error(identity: Row, names: Sequence[str], error: str, code: str) -> Row:
+    """Return the row of a flight of which nothing is known, because an error ended it.
+
+    Args:
+        identity: columns that tell what was to be flown.
+        names: of all columns; the others are null.
+        error: in words.
+        code: digest of the sources that met it.
+    """
+    return dict.fromkeys(names) | identity | {"outcome": _NOT_FLOWN + error, "code": code}
+
+
+def is_flown(row: Row) -> bool:
+    """Return whether a row is the result of a flight, and not of an error that ended it."""
+    return not str(row["outcome"]).startswith(_NOT_FLOWN)
 
 
 def cells(
@@ -118,6 +138,12 @@ def cells(
 def cell_of(row: Row) -> Cell:
     """The cell that a row belongs to."""
     return Cell(**{name: row[name] for name in CELL_FIELDS})
+
+
+def unflown(trial: Trial, error: str, code: str) -> Row:
+    """Return the row of a trial that an error ended; it has not arrived."""
+    cell = {name: getattr(trial.cell, name) for name in CELL_FIELDS}
+    return row_of_error(cell | {"seed": trial.seed, "arrived": False}, SCHEMA.names, error, code)
 
 
 def trial_of(row: Row) -> Trial:

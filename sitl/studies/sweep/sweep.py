@@ -17,6 +17,7 @@ from rich.table import Table
 from sitl.studies.campaign.progress import collect
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.store import RowStore, writing
+from sitl.studies.campaign.trials import row_of_error
 from sitl.studies.campaign.worker_pool import on_this_machine
 from sitl.studies.sweep.figures import FIGURES, SHOWN, Combination, Row, combinations, schema_of
 from sitl.studies.sweep.flight import FlySweep
@@ -72,7 +73,8 @@ def sweep(options: SweepOptions) -> int:
         print(f"{len(flights)} flights, {len(flights) - len(todo)} of them there already; {options.out}", flush=True)
         jobs = min(options.jobs, max(1, len(todo)))
         flown = on_this_machine(todo, jobs, FlySweep(options.out / BASE, tuple(axes), code))
-        count, errors = collect(flown, len(todo), store, noted=("failed", lambda row: row["outcome"] != "completed"))
+        noted = "failed", lambda row: row["outcome"] != "completed"
+        count, errors = collect(flown, len(todo), store, noted=noted, unflown=partial(_unflown, axes, code=code))
     rows = [row for row in store.rows if _key_of_row(axes, row) in keyed]
     found = combinations(axes, rows)
     report = write_page(options.out, axes, found, code, config_text=dump(base))
@@ -102,6 +104,13 @@ def _key(axes: Sequence[Axis], flight: Flight) -> _Key:
     """Return by what a flight is told from others."""
     values = (axis.stored(value) for axis, (_, value) in zip(axes, flight.settings, strict=True))
     return tuple(values), flight.seed
+
+
+def _unflown(axes: Sequence[Axis], flight: Flight, error: str, code: str) -> Row:
+    """Return the row of a flight that an error ended."""
+    values, seed = _key(axes, flight)
+    swept = {axis.key: value for axis, value in zip(axes, values, strict=True)}
+    return row_of_error(swept | {"seed": seed}, schema_of(axes).names, error, code)
 
 
 def _key_of_row(axes: Sequence[Axis], row: Row) -> _Key:

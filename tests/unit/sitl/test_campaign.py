@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +20,16 @@ from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS
 from sitl.studies.campaign.conditions.layouts import least_sum_m
 from sitl.studies.campaign.conditions.scenarios import SCENARIOS, layout_of
 from sitl.studies.campaign.flight import config_of, drawn
-from sitl.studies.campaign.page import again
+from sitl.studies.campaign.page import again, write_page
+from sitl.studies.campaign.progress import collect
 from sitl.studies.campaign.store import Store
-from sitl.studies.campaign.trials import CELL_FIELDS, SCHEMA, Cell, Row, Trial, cells
+from sitl.studies.campaign.summary import CellSummary, Share, summaries
+from sitl.studies.campaign.trials import CELL_FIELDS, SCHEMA, Cell, Row, Trial, cells, unflown
 from sitl.studies.campaign.worker_pool import on_cluster, on_this_machine
 from swarmctl.bus import topics
 from swarmctl.bus.bus import DEFAULT_LEASE_MS, agent_name
 from swarmctl.bus.local.hub import LocalHub
+from swarmctl.bus.messages.json_messages import MAX_OBSTACLES
 from swarmctl.config import load
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.obstacle import Obstacle
@@ -209,6 +214,50 @@ def test_a_trial_that_fails_is_reported_and_the_others_go_on() -> None:
     results = dict(on_this_machine(trials, 1, broken))
     assert results[trials[1]] == "RuntimeError: no such luck"
     assert [results[trials[i]]["seed"] for i in (0, 2)] == [1, 3]  # type: ignore[index]
+
+
+def flown(trial: Trial) -> Row:
+    nothing = dict.fromkeys(("collided", "deadlocked"), False) | dict.fromkeys(("plans_failed", "cpu_s"), 1)
+    return row_of(trial) | nothing | {"arrived": True, "outcome": "arrived", "flight_time_s": 5.0}
+
+
+def flown_but_for_two(trial: Trial) -> Row:
+    if trial.seed == 2:
+        raise ConfigError("campaign", ["no room"])
+    return flown(trial)
+
+
+def test_a_trial_that_fails_counts_is_named_and_is_flown_again(tmp_path: Path) -> None:
+    trials = [Trial(CELL, seed) for seed in (1, 2, 3)]
+
+    def go_on(fly: Callable[[Trial], Row]) -> tuple[CellSummary, str]:
+        with Store(tmp_path, "this") as store:
+            missing = store.missing(trials)
+            add = partial(unflown, code="this")
+            collect(on_this_machine(missing, 1, fly), len(missing), store, noted=("", bool), unflown=add)
+        (summary,) = summaries(Store(tmp_path, "this").rows)
+        return summary, write_page(tmp_path, Store(tmp_path, "this").rows).read_text(encoding="utf-8")
+
+    summary, page = go_on(flown_but_for_two)
+    assert (summary.not_flown, summary.arrived, summary.collided) == (1, Share(2, 3), Share(0, 2))
+    assert "not flown: ConfigError: campaign: no room" in page
+    assert Store(tmp_path, "this").missing(trials) == trials[1:2]
+    summary, page = go_on(flown)
+    assert (summary.not_flown, summary.arrived, summary.collided) == (0, Share(3, 3), Share(0, 3))
+    assert "not flown" not in page
+
+
+def test_a_cell_of_which_nothing_was_flown_is_not_a_success(tmp_path: Path) -> None:
+    rows = [unflown(Trial(CELL, 1), "no room", "this")]
+    (summary,) = summaries(rows)
+    assert (summary.arrived, summary.collided) == (Share(0, 1), Share(0, 0))
+    assert "class=ok" not in write_page(tmp_path, rows).read_text(encoding="utf-8").replace('"', "")
+
+
+def test_every_maze_has_no_more_columns_than_agents_keep() -> None:
+    for seed in (5, 17, 23, 41):  # whose first walls are of 65 posts and more
+        cell = replace(CELL, scenario="maze", agents=10)
+        assert 55 < len(config_of(cell, seed, drawn(cell, seed), 10).obstacles) <= MAX_OBSTACLES
 
 
 def test_no_cluster_is_refused_in_words() -> None:

@@ -211,3 +211,22 @@ def test_a_folder_that_can_not_be_made_is_3_in_words(tmp_path: Path, capsys: pyt
     assert main(["--set", "sitl.mass_scale=1", "--out", str(tmp_path / "file" / "out")]) == 3
     said = capsys.readouterr().err
     assert said == f"{tmp_path}/file/out: can't be written: Not a directory. Choose another with --out\n"
+
+
+def test_a_flight_that_an_error_ends_counts_and_is_flown_again(
+    flown: list[Flight], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flies = FlySweep.__call__
+
+    def breaks(self: FlySweep, flight: Flight) -> Row:
+        if flight.seed == 2:
+            raise RuntimeError("diverged")
+        return flies(self, flight)
+
+    monkeypatch.setattr(FlySweep, "__call__", breaks)
+    assert run(tmp_path, RADIUS, "--seeds=2") == 4
+    assert [row["outcome"] for row in rows_in(tmp_path)].count("not flown: RuntimeError: diverged") == 2
+    assert capsys.readouterr().out.count(" 1/2 ") == 2
+    monkeypatch.setattr(FlySweep, "__call__", flies)
+    assert run(tmp_path, RADIUS, "--seeds=2") == 0
+    assert [row["outcome"] for row in rows_in(tmp_path)] == ["completed"] * 4

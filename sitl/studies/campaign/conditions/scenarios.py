@@ -16,6 +16,7 @@ import numpy as np
 
 from sitl.studies.campaign.conditions.events import Appearance, Death, Partition, ScenarioEvent
 from sitl.studies.campaign.conditions.layouts import far_goals, forest, permuted, ring, scattered, walls
+from swarmctl.bus.messages.json_messages import MAX_OBSTACLES
 from swarmctl.core.clock import ClockError
 from swarmctl.core.types import Array
 
@@ -206,8 +207,14 @@ def _forest(rng: np.random.Generator, agents: int) -> Layout:
     return Layout(size=SMALL, starts_ned_m=starts, settings=settings, limit_s=60.0, goals_ned_m=goals, arrive_m=0.1)
 
 
+def _maze_posts(rng: np.random.Generator) -> Array:
+    return walls(rng, np.array([-3.0, -1.0, 1.0, 3.0]), 4.0, (0.6, 1.2), gap_m=1.2)
+
+
 def _maze(rng: np.random.Generator, agents: int) -> Layout:
-    posts = walls(rng, np.array([-3.0, -1.0, 1.0, 3.0]), 4.0, (0.6, 1.2), gap_m=1.2)
+    posts = _maze_posts(rng)
+    while len(posts) > MAX_OBSTACLES:  # drawn again, so that every seed that fits keeps its own
+        posts = _maze_posts(rng)
     width = np.linspace(-3.0, 3.0, agents)
     starts = np.stack([np.full(agents, -4.5), rng.permutation(width), np.full(agents, -1.0)], axis=1)
     goals = np.stack([np.full(agents, 4.5), rng.permutation(width), np.full(agents, -1.0)], axis=1)
