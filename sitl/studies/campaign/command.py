@@ -31,7 +31,7 @@ from sitl.studies.campaign.flight import config_of, drawn
 from sitl.studies.campaign.page import share_text, write_page
 from sitl.studies.campaign.progress import collect
 from sitl.studies.campaign.quick import QUICK
-from sitl.studies.campaign.source import code_id
+from sitl.studies.campaign.source import code_of, own_digest
 from sitl.studies.campaign.store import Store
 from sitl.studies.campaign.summary import summaries
 from sitl.studies.campaign.trials import Cell, Row, Trial, cells, trial_of, unflown
@@ -55,14 +55,13 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     trials = _trials(options)
     began_s = time.monotonic()
-    code = code_id()
+    own = own_digest(_own_folder(trials[0]))
+    code, fly = code_of(own), partial(fly_trial, own=own)
     with Store(options.out, code, options.mix) as store:
         missing = store.missing(trials)
         print(f"{len(trials)} runs, {len(trials) - len(missing)} of them there already; {options.out}", flush=True)
         jobs = min(options.jobs, max(1, len(missing)))
-        flown = (
-            on_cluster(missing, options.dask, fly_trial) if options.dask else on_this_machine(missing, jobs, fly_trial)
-        )
+        flown = on_cluster(missing, options.dask, fly) if options.dask else on_this_machine(missing, jobs, fly)
         noted = "collided", lambda row: bool(row["collided"])
         count, errors = collect(flown, len(missing), store, noted=noted, unflown=partial(unflown, code=code))
     hours = (time.monotonic() - began_s) / 3600.0
@@ -114,6 +113,12 @@ def _trials(options: argparse.Namespace) -> list[Trial]:
     return [
         Trial(cell, seed) for seed in seeds for cell in found
     ]  # seeds are the outer loop, so that all cells grow together
+
+
+def _own_folder(trial: Trial) -> str:
+    """Return the folder of own modules, which is that of every trial; "" for none."""
+    cell, seed = trial.cell, trial.seed
+    return config_of(cell, seed, drawn(cell, seed), cell.agents).own_folder
 
 
 def _problems(cell: Cell, seed: int) -> Iterator[str]:

@@ -16,7 +16,7 @@ from sitl.studies.campaign.conditions.disturbances import disturbed
 from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS, UNCOOPERATIVE, wind_settings
 from sitl.studies.campaign.conditions.layouts import least_sum_m
 from sitl.studies.campaign.conditions.scenarios import AIRFRAMES, SCENARIOS, Layout, layout_of, settings_of
-from sitl.studies.campaign.source import code_id
+from sitl.studies.campaign.source import code_of
 from sitl.studies.campaign.trials import Cell, Row, Trial
 from swarmctl.config import Config, load
 from swarmctl.control.reference.kinds.goto import GotoParams
@@ -31,15 +31,20 @@ _AFTER_CONTACT_S = 0.5  # flown on, to measure the depth of a contact
 _BAD_PLANS = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL, PlanStatus.NOT_CERTIFIED)
 
 
-def fly(trial: Trial) -> Row:
-    """Fly one trial and return its row, a pure function of the trial except `cpu_s`."""
+def fly(trial: Trial, own: str = "") -> Row:
+    """Fly one trial and return its row, a pure function of the trial except `cpu_s`.
+
+    Args:
+        trial: what is flown.
+        own: digest of the own modules that fly it, see `sitl.studies.campaign.source`.
+    """
     began_s = time.process_time()
     cell = trial.cell
     layout = drawn(cell, trial.seed)
     flight = TrialFlight(trial, layout)
     flight.run()
     alone_s = _alone_s(trial, layout) if SCENARIOS[cell.scenario].alone else None
-    return flight.row(alone_s) | {"cpu_s": time.process_time() - began_s, "code": code_id()}
+    return flight.row(alone_s) | {"cpu_s": time.process_time() - began_s, "code": code_of(own)}
 
 
 def drawn(cell: Cell, seed: int) -> Layout:

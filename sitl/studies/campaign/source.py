@@ -1,10 +1,12 @@
-"""Identity of the code that flew a trial: a digest of the sources that can change its result."""
+"""Identity of the code that flew a trial: a digest of the sources that can change its result, the user's own too."""
 
 from __future__ import annotations
 
 import hashlib
 from functools import cache
 from pathlib import Path
+
+from swarmctl.own_modules import own_sources
 
 _PACKAGES = ("sitl", "swarmctl")
 _STUDIES = ("campaign", "sweep")
@@ -28,3 +30,16 @@ def code_id() -> str:
             continue
         digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:12]
+
+
+def own_digest(folder: str) -> str:
+    """Return a digest of the own modules that this process has imported from a folder; "" for none."""
+    digest, own = hashlib.sha256(), own_sources(folder)
+    for path in own:
+        digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest() if own else ""
+
+
+def code_of(own: str) -> str:
+    """Return the digest of the sources that fly: those of `code_id`, and own modules by their `own_digest`."""
+    return hashlib.sha256(f"{code_id()} {own}".encode()).hexdigest()[:12] if own else code_id()

@@ -18,11 +18,11 @@ from swarmctl.process_lifetime import serve_parent
 _Job = TypeVar("_Job")
 
 
-def fly_trial(trial: Trial) -> Row:
+def fly_trial(trial: Trial, own: str = "") -> Row:
     """Call `sitl.studies.campaign.flight.fly`, imported in the worker."""
     from sitl.studies.campaign.flight import fly
 
-    return fly(trial)
+    return fly(trial, own)
 
 
 def on_this_machine(

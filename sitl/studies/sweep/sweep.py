@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -15,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sitl.studies.campaign.progress import collect
-from sitl.studies.campaign.source import code_id
+from sitl.studies.campaign.source import code_of, own_digest
 from sitl.studies.campaign.store import RowStore, writing
 from sitl.studies.campaign.trials import row_of_error
 from sitl.studies.campaign.worker_pool import on_this_machine
@@ -27,7 +26,7 @@ from swarmctl.config import Config, dump, load
 from swarmctl.core.text import told_apart
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError
 from swarmctl.files import replace_text
-from swarmctl.own_modules import OWN_FOLDER, OWN_KINDS, own_sources
+from swarmctl.own_modules import OWN_FOLDER, OWN_KINDS
 from swarmctl.telemetry.recording.file_names import STUDY_ROWS
 
 BASE = "config.toml"  # in the folder: the configuration to which swept values are applied
@@ -67,7 +66,7 @@ def sweep(options: SweepOptions) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
         _claim(options.out, base)
     began_s, keyed = time.monotonic(), {_key(axes, flight): flight for flight in flights}
-    code = _code_of(base)
+    code = code_of(own_digest(base.own_folder))
     with RowStore(options.out, code, schema=schema_of(axes), job_of=partial(_key_of_row, axes)) as store:
         todo = [keyed[key] for key in store.missing(keyed)]
         print(f"{len(flights)} flights, {len(flights) - len(todo)} of them there already; {options.out}", flush=True)
@@ -89,15 +88,6 @@ def sweep(options: SweepOptions) -> int:
 def _names_own(axes: Sequence[Axis]) -> bool:
     """Return whether a swept value is an own controller or mission."""
     return any(axis.key in OWN_KINDS and ":" in value for axis in axes for value in axis.values)
-
-
-def _code_of(base: Config) -> str:
-    """Return the digest of the sources that fly: those of swarmctl, and own modules of the configuration's folder."""
-    digest = hashlib.sha256(code_id().encode())
-    own = own_sources(base.own_folder)
-    for path in own:
-        digest.update(str(path.relative_to(base.own_folder)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:12] if own else code_id()
 
 
 def _key(axes: Sequence[Axis], flight: Flight) -> _Key:

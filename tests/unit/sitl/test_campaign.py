@@ -22,6 +22,7 @@ from sitl.studies.campaign.conditions.scenarios import SCENARIOS, layout_of
 from sitl.studies.campaign.flight import config_of, drawn
 from sitl.studies.campaign.page import again, write_page
 from sitl.studies.campaign.progress import collect
+from sitl.studies.campaign.source import code_of
 from sitl.studies.campaign.store import Store
 from sitl.studies.campaign.summary import CellSummary, Share, summaries
 from sitl.studies.campaign.trials import CELL_FIELDS, SCHEMA, Cell, Row, Trial, cells, unflown
@@ -252,6 +253,33 @@ def test_a_cell_of_which_nothing_was_flown_is_not_a_success(tmp_path: Path) -> N
     (summary,) = summaries(rows)
     assert (summary.arrived, summary.collided) == (Share(0, 1), Share(0, 0))
     assert "class=ok" not in write_page(tmp_path, rows).read_text(encoding="utf-8").replace('"', "")
+
+
+OWN = """
+from swarmctl.control.controllers.own import FeedbackController
+
+class Own(FeedbackController):
+    def accel_ned_m_s2(self, pos, vel, wanted_pos, wanted_vel, wanted_accel):
+        return {gain} * (wanted_pos - pos)
+"""
+
+
+def test_an_own_controller_that_has_changed_is_other_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fly(trial: Trial, own: str) -> Row:
+        return flown(trial) | {"code": code_of(own)}
+
+    monkeypatch.setattr("sitl.studies.campaign.command.fly_trial", fly)
+    module = tmp_path / "campaign_own.py"
+    sets = [f"--set=own_folder={tmp_path}", "--set=controller.kind=campaign_own:Own"]
+    asked = [*sets, "--agents", "2", "--trials", "1", "--jobs", "1", "--out", str(tmp_path / "out")]
+    module.write_text(OWN.format(gain=1.0))
+    assert main(asked) == main(asked) == 0
+    assert "1 runs, 1 of them there already" in capsys.readouterr().out
+    module.write_text(OWN.format(gain=12.5))
+    assert main(asked) == 2
+    assert "flown by other sources" in capsys.readouterr().err
 
 
 def test_every_maze_has_no_more_columns_than_agents_keep() -> None:

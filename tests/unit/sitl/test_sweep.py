@@ -129,7 +129,7 @@ def test_another_configuration_other_keys_or_other_code_are_refused(
     assert "mission.duration_s was 37.7 and is 5.0" in capsys.readouterr().err
     assert run(tmp_path, KIND) == 2
     assert "other columns" in capsys.readouterr().err
-    monkeypatch.setattr("sitl.studies.sweep.sweep.code_id", lambda: "another")
+    monkeypatch.setattr("sitl.studies.campaign.source.code_id", lambda: "another")
     assert run(tmp_path, RADIUS) == 2
     said = capsys.readouterr().err
     assert "flown by other sources" in said and "give a new --out" in said
