@@ -172,7 +172,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--delay", metavar="MS,..", type=_numbers(float, 0, 5000), default=[0.0], help="of every message on the bus")
     add("--loss", metavar="P,..", type=_numbers(float, 0, 1), default=[0.0], help="0..1, of unreliable messages")
     add("--noise", metavar="NAME,..", type=_names(NOISES), default=["exact"], help=", ".join(NOISES))
-    add("--wind", metavar="M/S,..", type=_numbers(float, 0, 40), default=[0.0], help="mean, with turbulence of as much")
+    add(
+        "--wind",
+        metavar="M/S,..",
+        type=_numbers(float, 0, 40),
+        default=[0.0],
+        help="mean, with turbulence of as much, or of the disturbance",
+    )
     add("--protections", metavar="NAME,..", type=_names(PROTECTIONS), default=["default"], help=", ".join(PROTECTIONS))
     add("--airframe", metavar="NAME,..", type=_names(AIRFRAMES), default=["own"], help=", ".join(AIRFRAMES))
     add("--disturbance", metavar="NAME[:STRENGTH],..", type=_disturbances, default=[NONE], help="as listed below")

@@ -70,13 +70,13 @@ def config_of(cell: Cell, seed: int, layout: Layout, agents: int, *, extra: Sequ
         [
             "sitl.start=air",
             f"sitl.physics_hz={PHYSICS_HZ}",
+            *wind_settings(cell.wind_m_s),  # first: turbulence of a disturbance is that one's
             *settings_of(layout, agents),
             f"name={cell.scenario}",
             f"seed={seed}",
             f"bus.delay_ms={cell.delay_ms}",
             f"bus.loss_01={cell.loss}",
             *noise.settings,
-            *wind_settings(cell.wind_m_s),
             *PROTECTIONS[cell.protections],
             *cell.sets.split(),
             *extra,

@@ -174,6 +174,13 @@ def test_the_strength_of_a_disturbance_is_chosen() -> None:
     )
 
 
+def test_turbulence_of_a_disturbance_is_flown_in_a_wind_too() -> None:
+    for disturbance, turbulence_m_s in ((NONE, 2.0), ("turbulence", 8.0), ("turbulence:5", 5.0)):
+        cell = replace(CELL, wind_m_s=2.0, disturbance=disturbance)
+        wind = config_of(cell, 1, drawn(cell, 1), 3).sitl.wind
+        assert (wind.mean_ned_m_s, wind.turbulence_m_s) == ((0.0, 2.0, 0.0), turbulence_m_s)
+
+
 def test_another_airframe_and_its_gusts_take_more_room() -> None:
     sets = {"": 0.9, "separation.gust_m_s=8": 4.01}
     for text, radius_m in sets.items():
