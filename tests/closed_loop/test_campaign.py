@@ -106,6 +106,22 @@ def test_scenario_events_happen_in_flight() -> None:
         assert ages_ms[-1] < 150.0
 
 
+def test_a_disturbance_of_every_vehicle_has_a_flight_alone_to_compare_with() -> None:
+    cell = Cell(
+        scenario="random",
+        agents=2,
+        delay_ms=0.0,
+        loss=0.0,
+        noise="exact",
+        wind_m_s=0.0,
+        protections="default",
+        disturbance="masses",  # settings that name both vehicles
+    )
+    row = fly(Trial(cell, 1))
+    assert row["outcome"] == "arrived"
+    assert 2.0 < row["unconstrained_time_s"] < 8.0
+
+
 @pytest.mark.process
 def test_a_killed_campaign_resumes(tmp_path: Path) -> None:
     asked = ["--scenario", "swap", "--agents", "2", "--protections", "off", "--jobs", "2", "--out", str(tmp_path)]

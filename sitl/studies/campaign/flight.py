@@ -12,7 +12,7 @@ import numpy as np
 
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.collision_monitor import CollisionMonitor
-from sitl.studies.campaign.conditions.disturbances import disturbed
+from sitl.studies.campaign.conditions.disturbances import NONE, disturbed
 from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS, UNCOOPERATIVE, wind_settings
 from sitl.studies.campaign.conditions.layouts import least_sum_m
 from sitl.studies.campaign.conditions.scenarios import AIRFRAMES, SCENARIOS, Layout, layout_of, settings_of
@@ -43,7 +43,7 @@ def fly(trial: Trial, own: str = "") -> Row:
     layout = drawn(cell, trial.seed)
     flight = TrialFlight(trial, layout)
     flight.run()
-    alone_s = _alone_s(trial, layout) if SCENARIOS[cell.scenario].alone else None
+    alone_s = _alone_s(trial) if SCENARIOS[cell.scenario].alone else None
     return flight.row(alone_s) | {"cpu_s": time.process_time() - began_s, "code": code_of(own)}
 
 
@@ -228,14 +228,19 @@ class TrialFlight:
         return sum(committing) if committing else None
 
 
-def _alone_s(trial: Trial, layout: Layout) -> float | None:
-    """Return the single-agent flight time of the longest path, without obstacles."""
+def _alone_s(trial: Trial) -> float | None:
+    """Return the single-agent flight time of the longest path, without obstacles and without the disturbance.
+
+    A disturbance is drawn for the whole swarm, and may be of vehicles that are not there.
+    """
+    calm = replace(trial.cell, disturbance=NONE)
+    layout = drawn(calm, trial.seed)
     if layout.goals_ned_m is None:
         return None
     far = int(np.linalg.norm(layout.goals_ned_m - layout.starts_ned_m, axis=1).argmax())
     goal: Array = layout.goals_ned_m[far : far + 1]
     speeds = tuple(s for s in layout.settings if not s.startswith(("mission.goto=", "obstacles=")))
-    mission = config_of(trial.cell, trial.seed, layout, len(layout.starts_ned_m)).mission
+    mission = config_of(calm, trial.seed, layout, len(layout.starts_ned_m)).mission
     goto = mission.section(GotoParams)
     lone = replace(
         layout,
@@ -249,7 +254,7 @@ def _alone_s(trial: Trial, layout: Layout) -> float | None:
         uncooperative=frozenset(),
         lost=frozenset(),
     )
-    flight = TrialFlight(Trial(replace(trial.cell, agents=1, delay_ms=0.0, loss=0.0), trial.seed), lone)
+    flight = TrialFlight(Trial(replace(calm, agents=1, delay_ms=0.0, loss=0.0), trial.seed), lone)
     flight.run()
     found: Any = flight.row(None)["flight_time_s"]
     return None if found is None else float(found)

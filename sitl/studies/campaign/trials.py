@@ -71,7 +71,7 @@ SCHEMA = pa.schema(
         ),  # arrived, collided, deadlocked, late, what went wrong, or "not flown: " and why
         pa.field("min_clearance_m", pa.float64()),  # smallest true distance of a body's hull to an obstacle's surface
         pa.field("arrived_agents", pa.int32()),
-        pa.field("unconstrained_time_s", pa.float64()),  # of the longest way, flown alone
+        pa.field("unconstrained_time_s", pa.float64()),  # of the longest way, flown alone and undisturbed
         pa.field("goal_sum_m", pa.float64()),  # sum of all distances to the goals at the end
         pa.field("least_sum_m", pa.float64()),  # the least that sum can be (same goal)
         pa.field("plans_failed", pa.int64()),  # ticks of all agents without a certified plan
