@@ -123,7 +123,8 @@ class TrialFlight:
                 for event in self._layout.events:
                     event.step(lockstep, t_s, pos, vel)
             appeared = [o for event in self._layout.events for o in event.obstacles(t_s)]
-            self.monitor.see(now_s, pos, vel, (*lockstep.config.obstacles, *appeared))
+            configured = (o.moved(now_s) for o in lockstep.config.obstacles)  # at their centres as the clock begins
+            self.monitor.see(now_s, pos, vel, (*configured, *appeared))
             slow = t_s > _REST_S and np.linalg.norm(vel, axis=1).max() < _REST_M_S
             self._resting_since_s = min(self._resting_since_s, now_s) if slow else math.inf
             if self.monitor.collided:

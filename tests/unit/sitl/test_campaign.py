@@ -19,7 +19,7 @@ from sitl.studies.campaign.conditions.events import Appearance
 from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS
 from sitl.studies.campaign.conditions.layouts import least_sum_m
 from sitl.studies.campaign.conditions.scenarios import SCENARIOS, layout_of
-from sitl.studies.campaign.flight import config_of, drawn
+from sitl.studies.campaign.flight import TrialFlight, config_of, drawn
 from sitl.studies.campaign.page import again, write_page
 from sitl.studies.campaign.progress import collect
 from sitl.studies.campaign.source import code_of
@@ -179,6 +179,17 @@ def test_turbulence_of_a_disturbance_is_flown_in_a_wind_too() -> None:
         cell = replace(CELL, wind_m_s=2.0, disturbance=disturbance)
         wind = config_of(cell, 1, drawn(cell, 1), 3).sitl.wind
         assert (wind.mean_ned_m_s, wind.turbulence_m_s) == ((0.0, 2.0, 0.0), turbulence_m_s)
+
+
+def test_an_obstacle_that_moves_is_judged_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From 30 m above the middle of the circle on which two vehicles stand, at 20 m/s, for a second."""
+    sets = "obstacles=[{center_ned_m=[0,0,-30],vel_ned_m_s=[0,0,20],radius_m=0.5}]"
+    trial = Trial(replace(CELL, agents=2, sets=sets), 1)
+    flight = TrialFlight(trial, drawn(trial.cell, 1))
+    clock = flight.lockstep.clock
+    monkeypatch.setattr(flight, "_over", lambda: clock.now_us() >= 1_000_000)
+    flight.run()
+    assert flight.monitor.min_clearance_m == pytest.approx(np.hypot(4.0, 10.0) - 0.5 - 0.24, abs=0.05)
 
 
 def test_another_airframe_and_its_gusts_take_more_room() -> None:
