@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -16,9 +17,10 @@ import pytest
 
 from sitl.studies.campaign.command import main
 from sitl.studies.campaign.conditions.scenarios import layout_of
-from sitl.studies.campaign.flight import TrialFlight, fly
+from sitl.studies.campaign.flight import TrialFlight, drawn, fly
 from sitl.studies.campaign.page import REPORT
 from sitl.studies.campaign.quick import QUICK
+from sitl.studies.campaign.summary import Share, summaries
 from sitl.studies.campaign.trials import Cell, Row, Trial, trial_of
 from swarmctl.core.types import Phase
 from swarmctl.telemetry.recording.file_names import STUDY_ROWS
@@ -120,6 +122,25 @@ def test_a_disturbance_of_every_vehicle_has_a_flight_alone_to_compare_with() -> 
     row = fly(Trial(cell, 1))
     assert row["outcome"] == "arrived"
     assert 2.0 < row["unconstrained_time_s"] < 8.0
+
+
+def test_two_halves_that_stay_apart_stop_and_are_not_asked_to_arrive() -> None:
+    cell = Cell(
+        scenario="swap",
+        agents=2,
+        delay_ms=0.0,
+        loss=0.0,
+        noise="exact",
+        wind_m_s=0.0,
+        protections="guaranteed",
+        disturbance="split:0",
+    )
+    flight = TrialFlight(Trial(cell, 1), replace(drawn(cell, 1), limit_s=14.0))
+    flight.run()
+    row = flight.row(None) | {"cpu_s": 0.0}
+    assert (row["outcome"], row["arrived"], row["collided"]) == ("stopped", None, False)
+    (summary,) = summaries([row])
+    assert (summary.arrived, summary.collided) == (Share(0, 0), Share(0, 1))
 
 
 @pytest.mark.process

@@ -17,7 +17,7 @@ from swarmctl.core.types import Array
 Mask = NDArray[np.bool_]
 
 _ARRIVED_M_S = 0.2  # a faster vehicle passes through
-_STILL_M = 0.1  # a vehicle that moves less than this ...
+STILL_M = 0.1  # a vehicle that moves less than this ...
 _STILL_S = 3.0  # ... in this time stands still
 
 
@@ -74,14 +74,14 @@ class CollisionMonitor:
         """Arrival time of the last expected vehicle; infinite when not all have arrived, or none is expected."""
         return float(self._since_s[self._expected].max()) if self._expected.any() else math.inf
 
-    def standing(self) -> Mask:
-        """Return the vehicles (N,) that have moved less than 0.1 m in the last 3 s; none before."""
+    def standing(self, still_m: float = STILL_M) -> Mask:
+        """Return the vehicles (N,) that have moved less than `still_m` in the last 3 s; none before."""
         end_s = self._trail[-1][0] if self._trail else 0.0
         recent = [pos for t_s, pos in self._trail if t_s >= end_s - _STILL_S]
         if not self._trail or end_s - self._trail[0][0] < _STILL_S:
             return np.zeros(len(self._expected), bool)
         moved = np.linalg.norm(np.stack(recent) - recent[-1], axis=2).max(axis=0)
-        return np.asarray(moved < _STILL_M)
+        return np.asarray(moved < still_m)
 
     def distance_m(self) -> Array:
         """Return the distances (N,) to the goals at the last sample."""

@@ -9,9 +9,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.collision_monitor import CollisionMonitor
+from sitl.studies.campaign.collision_monitor import STILL_M, CollisionMonitor
 from sitl.studies.campaign.conditions.disturbances import NONE, disturbed
 from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS, UNCOOPERATIVE, wind_settings
 from sitl.studies.campaign.conditions.layouts import least_sum_m
@@ -99,7 +100,7 @@ class TrialFlight:
         blind = {i: config_of(cell, trial.seed, layout, agents, extra=UNCOOPERATIVE) for i in layout.uncooperative}
         self.lockstep = Lockstep(config, own=blind, clocks=layout.clocks)
         self._agents = list(self.lockstep.agents)  # including those that will have died
-        expected = np.array([i not in layout.lost for i in range(agents)])
+        expected = self._expected()
         arrive_m = math.inf if layout.settles else layout.arrive_m + NOISES[cell.noise].arrive_m
         self.monitor = CollisionMonitor(config.separation.body_m, layout.goals_ned_m, arrive_m, expected)
         self._begin_s = math.nan
@@ -136,7 +137,8 @@ class TrialFlight:
         collided = monitor.collided
         arrived = not collided and not self._problems and self._arrived_s() < math.inf
         stuck = self._out_of_time and self._someone_stands_short()
-        outcome = self._outcome(collided, arrived, stuck)
+        stopped = not collided and not self._problems and self._out_of_time and self._all_stand_unexpected()
+        outcome = "stopped" if stopped else self._outcome(collided, arrived, stuck)
         ticks = [log.ticks for log in self.lockstep.logs]
         charged = [rows[rows["phase"] == Phase.TRACK] for rows in ticks]
         separation = self.lockstep.config.separation
@@ -150,7 +152,7 @@ class TrialFlight:
             "protections": cell.protections,
             "collided": collided,
             "min_separation_m": _finite(monitor.min_separation_m),
-            "arrived": arrived,
+            "arrived": None if stopped else arrived,
             "flight_time_s": self._arrived_s() - self._begin_s if arrived else None,
             "noise": cell.noise,
             "wind_m_s": cell.wind_m_s,
@@ -198,8 +200,16 @@ class TrialFlight:
     def _someone_stands_short(self) -> bool:
         if self._layout.goals_ned_m is None or self._layout.settles:
             return False
-        expected = np.array([i not in self._layout.lost for i in range(self._trial.cell.agents)])
-        return bool((self.monitor.standing() & ~self.monitor.arrived & expected).any())
+        return bool((self.monitor.standing() & ~self.monitor.arrived & self._expected()).any())
+
+    def _all_stand_unexpected(self) -> bool:
+        """Return whether nobody is expected at a goal, and everybody stands, as exactly as positions are known."""
+        if self._layout.goals_ned_m is None or self._layout.settles or self._expected().any():
+            return False
+        return bool(self.monitor.standing(STILL_M + NOISES[self._trial.cell.noise].arrive_m).all())
+
+    def _expected(self) -> NDArray[np.bool_]:
+        return np.array([i not in self._layout.lost for i in range(self._layout.agents)])
 
     def _outcome(self, collided: bool, arrived: bool, stuck: bool) -> str:
         if collided:

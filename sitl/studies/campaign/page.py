@@ -40,7 +40,7 @@ def write_page(directory: Path, rows: Sequence[Row], runs_per_hour: float | None
         cells=summaries(rows),
         scenarios=SCENARIOS,
         columns=_columns,
-        failed=sorted((row for row in rows if not row["arrived"]), key=trial_of),
+        failed=sorted((row for row in rows if row["arrived"] is False), key=trial_of),
         most_listed=_MAX_LISTED,
         again=again,
     )

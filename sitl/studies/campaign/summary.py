@@ -39,7 +39,7 @@ class CellSummary:
     cell: Cell
     not_flown: int  # runs that an error ended
     collided: Share  # of the runs that were flown
-    arrived: Share  # of all runs
+    arrived: Share  # of all runs in which somebody was expected to
     deadlocked: Share  # of the runs that were flown
     min_separation_m: float | None  # of all runs
     min_clearance_m: float | None
@@ -69,9 +69,9 @@ def _summary(cell: Cell, asked: Sequence[Row]) -> CellSummary:
     return CellSummary(
         cell=cell,
         not_flown=len(asked) - len(rows),
-        collided=_count(rows, "collided"),
+        collided=_count(asked, "collided"),
         arrived=_count(asked, "arrived"),
-        deadlocked=_count(rows, "deadlocked"),
+        deadlocked=_count(asked, "deadlocked"),
         min_separation_m=_least(rows, "min_separation_m"),
         min_clearance_m=_least(rows, "min_clearance_m"),
         time_median_s=median(times) if times else None,
@@ -90,7 +90,8 @@ def _mean(rows: Sequence[Row], name: str) -> float:
 
 
 def _count(rows: Sequence[Row], name: str) -> Share:
-    return Share(sum(bool(row[name]) for row in rows), len(rows))
+    known = [row[name] for row in rows if row[name] is not None]
+    return Share(sum(known), len(known))
 
 
 def _least(rows: Sequence[Row], name: str) -> float | None:

@@ -58,7 +58,7 @@ SCHEMA = pa.schema(
         pa.field("protections", pa.string()),
         pa.field("collided", pa.bool_()),  # in truth: two bodies touched, or a body and an obstacle
         pa.field("min_separation_m", pa.float64()),  # smallest true distance of two centres at any time
-        pa.field("arrived", pa.bool_()),  # all expected vehicles, for good, without collision
+        pa.field("arrived", pa.bool_()),  # all expected vehicles, for good, without collision; null if none is
         pa.field("flight_time_s", pa.float64()),  # from the begin of the mission to the last arrival
         pa.field("noise", pa.string()),
         pa.field("wind_m_s", pa.float64()),
@@ -66,9 +66,7 @@ SCHEMA = pa.schema(
         pa.field("disturbance", pa.string()),
         pa.field("sets", pa.string()),
         pa.field("deadlocked", pa.bool_()),  # time ran out, and a vehicle that has not arrived stands still
-        pa.field(
-            "outcome", pa.string()
-        ),  # arrived, collided, deadlocked, late, what went wrong, or "not flown: " and why
+        pa.field("outcome", pa.string()),  # see docs/data_formats.md
         pa.field("min_clearance_m", pa.float64()),  # smallest true distance of a body's hull to an obstacle's surface
         pa.field("arrived_agents", pa.int32()),
         pa.field("unconstrained_time_s", pa.float64()),  # of the longest way, flown alone and undisturbed

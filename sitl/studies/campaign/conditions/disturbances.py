@@ -57,7 +57,7 @@ def _clocks(rng: np.random.Generator, layout: Layout, offset_ms: float) -> Layou
 
 
 def _split(rng: np.random.Generator, layout: Layout, heals_01: float) -> Layout:
-    """Cut the swarm into two groups; for good, only a majority is expected to arrive."""
+    """Cut the swarm into two groups; for good, only a majority is expected to arrive, and nobody of two halves."""
     agents = layout.agents
     order, size = rng.permutation(agents).tolist(), int(rng.integers(1, agents))
     groups = [frozenset(order[:size]), frozenset(order[size:])]
