@@ -267,7 +267,7 @@ class Autopilot:
     def set_mode(
         self, mode: Px4Mode, now_us: int, takeoff_alt_amsl_m: float | None = None, *, tell: bool = True
     ) -> Result:
-        """Change the mode by command; this cancels a running failsafe.
+        """Change the mode by command; this suspends a running failsafe.
 
         Without a take-off height, MIS_TAKEOFF_ALT is used. `tell`: explain a refusal.
         """
@@ -285,7 +285,7 @@ class Autopilot:
             self.flight.takeoff_alt_amsl_m = takeoff_alt_amsl_m
         if mode == Px4Mode.AUTO_LAND and self.armed:
             self.send_text(Severity.INFO, "Landing at current position\t")
-        self._failsafe.clear()
+        self._failsafe.suspend()
         self.enter(mode)
         return Result.ACCEPTED
 
@@ -373,9 +373,9 @@ class Autopilot:
         """Run the checks that PX4 does ten times a second."""
         origin = self.flight.origin
         breaches = self._fence.breaches(estimate.pos_ned_m, self.home_ned_m, origin) if origin else []
-        cause, action = self.watch.check(breaches, self.battery_01, now_us, armed=self.armed)
+        wanted, begun = self.watch.check(breaches, self.battery_01, now_us, armed=self.armed)
         if self.armed and not self.terminated:
-            self._failsafe.check(cause, action, now_us)
+            self._failsafe.check(wanted, begun, now_us)
 
     def _airborne_state(self) -> Landed:
         if not self.armed or self.mode == Px4Mode.OFFBOARD:

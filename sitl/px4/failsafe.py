@@ -1,8 +1,6 @@
 """Failsafes of PX4 besides a lost setpoint stream: geofence, battery, ground-station link.
 
-This module monitors and requests actions; `failsafe_actions` executes them. A Return or Land waits COM_FAIL_ACT_T
-seconds in Hold, so that a pilot can take over. A commanded mode ends a failsafe, and its cause acts again only after it
-ended.
+This module monitors and requests actions; `failsafe_actions` executes them.
 """
 
 from __future__ import annotations
@@ -85,20 +83,21 @@ class Watch:
         """Allow causes to act again, after disarming."""
         self._acted.clear()
 
-    def check(self, breaches: Sequence[str], battery_01: float, now_us: int, *, armed: bool) -> tuple[Cause, Action]:
-        """Return the newest action; WARN or less: nothing to do."""
-        wanted = (
-            (Cause.GEOFENCE, self._fence(breaches)),
-            (Cause.BATTERY, self._battery(battery_01, armed=armed)),
-            (Cause.GCS, self._gcs(now_us)),
-        )
-        best = Cause.GCS, Action.NONE
-        for cause, action in wanted:
-            before = self._acted.get(cause, Action.NONE)
-            self._acted[cause] = action
-            if armed and action > before and action > best[1]:
-                best = cause, action
-        return best
+    def check(
+        self, breaches: Sequence[str], battery_01: float, now_us: int, *, armed: bool
+    ) -> tuple[dict[Cause, Action], list[Cause]]:
+        """Return what every cause wants now, WARN or less being nothing, and those of an armed vehicle that want more.
+
+        A cause that was there before the vehicle was armed wants no more for that.
+        """
+        wanted = {
+            Cause.GEOFENCE: self._fence(breaches),
+            Cause.BATTERY: self._battery(battery_01, armed=armed),
+            Cause.GCS: self._gcs(now_us),
+        }
+        begun = [cause for cause, action in wanted.items() if armed and action > self._acted.get(cause, Action.NONE)]
+        self._acted.update(wanted)
+        return wanted, begun
 
     def _fence(self, breaches: Sequence[str]) -> Action:
         action = _pick(_FENCE_ACTIONS, self._parameters.integer("GF_ACTION"), Action.WARN)
