@@ -104,6 +104,7 @@ class SitlWorld:
             spawns_local_ned_m,
             dt_s,
             ground=not airborne,
+            below_z_m=params.ground_z_m - self._offset_ned_m[:, 2],
             mass_scale=params.mass_scale,
             thrust_curve_01=params.thrust_curve_01,
             ground_effect=params.ground_effect,

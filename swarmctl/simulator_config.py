@@ -138,6 +138,7 @@ class SimulatorParams(Params):
     preset: Literal["thesis", "x500", "crazyflie", "arducopter"] = "thesis"  # airframe
     attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # for the thesis airframe only
     start: Literal["ground", "air"] = "ground"  # air: vehicles begin at their start positions, without ground (thesis)
+    ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
     ekf_ready_s: float = Field(1.0, ge=0, le=60)  # from power-up until arming is possible; 4 in PX4
     mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
     estimator: Literal["exact", "gps", "external", "px4_gps", "px4_external"] = "exact"  # errors of their estimates

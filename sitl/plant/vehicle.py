@@ -120,6 +120,7 @@ class Plant:
         dt_s: float,
         *,
         ground: bool = True,
+        below_z_m: Array | float = 0.0,
         mass_scale: float = 1.0,
         thrust_curve_01: float = 0.0,
         ground_effect: bool = False,
@@ -131,6 +132,7 @@ class Plant:
             pos_ned_m: (N, 3) spawn positions; each vehicle's ground is the plane at its own z.
             dt_s: step.
             ground: False for no ground at all.
+            below_z_m: (N,) down coordinate above which heights count then, as if there were ground.
             mass_scale: true mass over the preset's.
             thrust_curve_01: k of a rotor's force (1 - k) u + k u^2 over its limit, at command u; PX4's THR_MDL_FAC.
             ground_effect: whether thrust increases close to the ground.
@@ -143,6 +145,7 @@ class Plant:
         self.state[0] = 1.0
         self.state[_POS] = np.asarray(pos_ned_m, dtype=np.float64).T
         self.ground_z_m: Array | None = self.state[12].copy() if ground else None
+        self._height_datum_z_m = below_z_m if self.ground_z_m is None else self.ground_z_m
         self.contact: Mask = np.full(count, ground)
         self.held: Mask = np.zeros(count, dtype=bool)  # clamped at the spawn pose
         self.mixer = Mixer(preset, count)
@@ -214,8 +217,8 @@ class Plant:
 
     @property
     def height_m(self) -> Array:
-        """Heights (N,) above the ground; above z = 0 where there is none."""
-        height_m: Array = (self.ground_z_m if self.ground_z_m is not None else 0.0) - self.state[12]
+        """Heights (N,) above the ground, or above where it would be."""
+        height_m: Array = self._height_datum_z_m - self.state[12]
         return height_m
 
     def rotor_01(self, vehicle: int) -> list[float]:

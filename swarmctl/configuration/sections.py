@@ -50,7 +50,6 @@ class SitlParams(SimulatorParams):
     """The built-in simulator that launch starts; disabled to fly other vehicles."""
 
     enabled: bool = True
-    ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
     link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only
 
 

@@ -50,6 +50,15 @@ def test_turbulence_follows_the_mean_wind() -> None:
     assert np.allclose(east[:, 2], north[:, 2])
 
 
+def test_turbulence_is_that_of_the_height_above_the_ground_where_vehicles_begin_in_the_air() -> None:
+    """Their local frames begin where they do, in which all of them would be at a height of 0."""
+    spawns = [(0.0, 0.0, -30.0), (5.0, 0.0, -12.0), (10.0, 0.0, -3.0)]
+    flown = FlownWorld(3, start="air", spawn_ned_m=spawns, ground_z_m=2.0)
+    assert flown.world.plant.height_m == pytest.approx([32.0, 14.0, 5.0], abs=0.01)
+    grounded = FlownWorld(3, spawn_ned_m=spawns, ground_z_m=2.0)
+    assert grounded.world.plant.height_m == pytest.approx([0.0, 0.0, 0.0])
+
+
 def test_a_seed_repeats_and_vehicles_differ() -> None:
     params = {"turbulence_m_s": 5.0}
     first, again, other = blown(params, 3.0, 2.0), blown(params, 3.0, 2.0), blown(params, 3.0, 2.0, seed=2)
