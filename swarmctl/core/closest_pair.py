@@ -1,4 +1,4 @@
-"""The smallest distance of any two vehicles at each instant, from sampled positions."""
+"""The smallest distances of vehicles from sampled positions: of any two at an instant, and of two between instants."""
 
 from __future__ import annotations
 
@@ -14,3 +14,11 @@ def closest_pair_m(pos_ned_m: Array) -> Array:
         apart_m = np.linalg.norm(pos_ned_m[:, i + 1 :] - pos_ned_m[:, i : i + 1], axis=2)
         least_m = np.fmin(least_m, np.fmin.reduce(apart_m, axis=1))
     return least_m
+
+
+def closest_m(before: Array, now: Array) -> Array:
+    """Return the least distance (M,) from the origin of points that move straight from `before` (M, D) to `now`."""
+    step = now - before
+    length2 = np.maximum(np.einsum("mc,mc->m", step, step), 1e-18)
+    share = np.clip(-np.einsum("mc,mc->m", before, step) / length2, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(before + share[:, None] * step, axis=1))

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.closest_pair import closest_m
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array
 
@@ -94,11 +95,3 @@ class CollisionMonitor:
         near = np.linalg.norm(pos_ned_m - self._goals, axis=1) < self._arrive_m
         there = near & (np.linalg.norm(vel_ned_m_s, axis=1) < _ARRIVED_M_S)
         self._since_s = np.where(there, np.minimum(self._since_s, t_s), math.inf)
-
-
-def closest_m(before: Array, now: Array) -> Array:
-    """Return the least distance (M,) from the origin of points that move straight from `before` (M, D) to `now`."""
-    step = now - before
-    length2 = np.maximum(np.einsum("mc,mc->m", step, step), 1e-18)
-    share = np.clip(-np.einsum("mc,mc->m", before, step) / length2, 0.0, 1.0)
-    return np.asarray(np.linalg.norm(before + share[:, None] * step, axis=1))

@@ -203,7 +203,7 @@ def flown_without(events: Sequence[Mapping[str, Any]]) -> frozenset[int]:
 def _evaluate_separation(
     tracks: Tracks, rules: Rules, here: Sequence[int], clock: _MissionClock
 ) -> tuple[dict[str, Any], list[str]]:
-    """Find the smallest distance over all pairs of `here` and common instants, also with heights scaled by downwash."""
+    """Find the smallest distance of all pairs of `here` at any time, also with heights scaled by downwash."""
     found: dict[str, Any] = {
         "min_m": None,
         "required_m": rules.required_separation_m,
@@ -217,16 +217,14 @@ def _evaluate_separation(
     violations = [f"separation of agent {agent} can't be judged: no positions were recorded" for agent in unknown]
     for i, j in itertools.combinations(known, 2):
         apart_m = tracks.pos_ned_m[:, i] - tracks.pos_ned_m[:, j]
-        distance_m = np.linalg.norm(apart_m, axis=1)
-        if not np.isfinite(distance_m).any():
+        nearest, scaled = tracks.nearest(apart_m), tracks.nearest(apart_m * scale)
+        if nearest is None or scaled is None:
             violations.append(f"separation of agents {i} and {j} can't be judged: no common positions were recorded")
             continue
-        nearest = int(np.nanargmin(distance_m))
-        least_m, at_s = float(distance_m[nearest]), clock.at_s(tracks.t_us[nearest])
+        least_m, at_s = nearest[0], clock.at_s(tracks.t_us[nearest[1]])
         if found["min_m"] is None or least_m < found["min_m"]:
             found |= {"min_m": least_m, "min_pair": [i, j], "min_at_s": at_s}
-        scaled_m = float(np.nanmin(np.linalg.norm(apart_m * scale, axis=1)))
-        found["scaled_min_m"] = min(scaled_m, scaled_m if found["scaled_min_m"] is None else found["scaled_min_m"])
+        found["scaled_min_m"] = min(scaled[0], scaled[0] if found["scaled_min_m"] is None else found["scaled_min_m"])
         if least_m < rules.required_separation_m:
             violations.append(
                 f"separation {least_m:.3f} m below {rules.required_separation_m:g} m "
@@ -264,18 +262,17 @@ def _evaluate_obstacles(
         counts = (elapsed_s >= 0.0) & (tracks.t_us <= gone_us)
         for agent in range(rules.agents):
             apart_m = tracks.pos_ned_m[:, agent] - center_ned_m
-            distance_m = np.linalg.norm(apart_m[:, : obstacle.axes], axis=1)
-            distance_m[~counts] = np.nan
-            if not np.isfinite(distance_m).any():
+            apart_m[~counts] = np.nan
+            nearest = tracks.nearest(apart_m[:, : obstacle.axes])
+            if nearest is None:
                 continue
-            nearest = int(np.nanargmin(distance_m))
-            least_m = float(distance_m[nearest])
+            least_m, instant = nearest
             if worst is None or least_m - required_m < worst[0] - worst[1]:
                 worst = (least_m, required_m)
             if least_m < required_m:
                 violations.append(
                     f"obstacle clearance {least_m:.3f} m below {required_m:g} m "
-                    f"between agent {agent} and obstacle {judged.number} at {clock.at_s(tracks.t_us[nearest]):.1f} s"
+                    f"between agent {agent} and obstacle {judged.number} at {clock.at_s(tracks.t_us[instant]):.1f} s"
                 )
     distance, required = worst or (None, None)
     return {"min_clearance_m": distance, "required_m": required}, _shorten(violations)

@@ -5,15 +5,18 @@ Pure numpy. Referee and report share this module, so that their figures agree.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.closest_pair import closest_m
 from swarmctl.core.types import Array, Phase
 
 GRID_US = 20_000
+_AT_ONCE_US = 2 * GRID_US  # instants that are farther apart do not follow each other
 GAP_US = 500_000  # no interpolation between reported positions farther apart in time
 _STALE_MS = GAP_US / 1e3  # an agent that receives nothing keeps recording the last known position
 _AGAIN_S = 0.5  # mission time that falls by more begins again; by less, somebody has set the clock
@@ -31,6 +34,31 @@ class Tracks:
     t_us: Array  # (T,) in the clock `time_field` names
     pos_ned_m: Array  # (T, agents, 3), NaN where unknown
     time_field: str  # "t_us" for true positions, "utc_us" for reported ones: agents may be on several hosts
+
+    def nearest(self, apart_m: Array) -> tuple[float, int] | None:
+        """Return the least length of vectors (T, D) that change with these tracks, and at which instant.
+
+        Between true positions that follow each other at once vehicles move straight, to a millimetre, and the least may
+        be there; the instant is then the later one. Reported positions are not that exact, and jump. None: none is
+        known.
+        """
+        lengths_m = np.linalg.norm(apart_m, axis=1)
+        if not np.isfinite(lengths_m).any():
+            return None
+        instant = int(np.nanargmin(lengths_m))
+        least_m = float(lengths_m[instant])
+        if self.time_field == "t_us":
+            step_m = float(np.fmax.reduce(np.abs(np.diff(apart_m, axis=0)), axis=None, initial=0.0))
+            reach_m = (
+                least_m + 0.5 * math.sqrt(apart_m.shape[1]) * step_m
+            )  # nobody beyond it comes nearer in half a step
+            near = np.fmin(lengths_m[:-1], lengths_m[1:]) <= reach_m
+            later = np.flatnonzero(near & (np.diff(self.t_us) <= _AT_ONCE_US)) + 1
+            between_m = closest_m(apart_m[later - 1], apart_m[later])
+            if len(later) and (between_m < least_m).any():
+                nearest = int(np.nanargmin(between_m))
+                least_m, instant = float(between_m[nearest]), int(later[nearest])
+        return least_m, instant
 
 
 @dataclass(frozen=True, slots=True)

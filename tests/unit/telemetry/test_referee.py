@@ -165,6 +165,41 @@ def test_separation_with_scaled_heights_is_reported_beside_the_true_one() -> Non
     assert same["scaled_min_m"] == pytest.approx(same["min_m"])
 
 
+CROSSING_S = np.arange(0, 5.001, 0.02)
+CROSSES = np.column_stack([6.0 * (CROSSING_S - 2.51), 0.0 * CROSSING_S, 0.0 * CROSSING_S])  # amid two instants
+
+
+def test_vehicles_that_pass_between_two_instants_are_judged_where_they_are_nearest() -> None:
+    other = -CROSSES + [0.0, 0.48, 0.0]
+    crossing = run(APART, truth(0, CROSSING_S, CROSSES), truth(1, CROSSING_S, other))
+    summary = evaluate(crossing, Rules(agents=2, required_separation_m=0.49, downwash=2.0), "completed")
+    found = summary["separation"]
+    assert (found["min_m"], found["scaled_min_m"]) == (pytest.approx(0.48, abs=1e-6), pytest.approx(0.48, abs=1e-6))
+    assert found["min_at_s"] == pytest.approx(2.52)
+    assert summary["outcome"] == "failed"
+
+
+def test_nothing_is_known_between_instants_that_do_not_follow_each_other() -> None:
+    around = np.abs(CROSSING_S - 2.51) > 0.1
+    other = -CROSSES + [0.0, 0.48, 0.0]
+    gap = run(APART, truth(0, CROSSING_S[around], CROSSES[around]), truth(1, CROSSING_S[around], other[around]))
+    found = evaluate(gap, Rules(agents=2, required_separation_m=0.49), "completed")["separation"]
+    assert found["min_m"] == pytest.approx(np.hypot(0.48, 12.0 * 0.11), abs=0.01)
+
+
+def test_an_obstacle_that_is_passed_between_two_instants_is_judged_where_it_is_nearest() -> None:
+    ball = Obstacle(center_ned_m=(0.0, 1.005, 0.0), radius_m=0.8, keep_out_m=1.006)
+    rules = Rules(
+        agents=1,
+        required_separation_m=0.5,
+        obstacles=(JudgedObstacle(number=0, obstacle=ball),),
+        obstacle_margin_m=0.0,
+    )
+    summary = evaluate(run({0: ticks(5, (0, 0, 0))}, truth(0, CROSSING_S, CROSSES)), rules, "completed")
+    assert summary["obstacles"]["min_clearance_m"] == pytest.approx(1.005, abs=1e-6)
+    assert any("obstacle clearance 1.005 m" in text for text in summary["violations"])
+
+
 @pytest.mark.parametrize(("least_m", "limit_m", "outcome"), [(0.86, 0.85, "completed"), (0.84, 0.85, "failed")])
 def test_separation_decides_the_outcome(least_m: float, limit_m: float, outcome: str) -> None:
     assert evaluate(closing(least_m), Rules(agents=2, required_separation_m=limit_m), "completed")["outcome"] == outcome
