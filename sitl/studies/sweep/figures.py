@@ -72,7 +72,7 @@ FIGURES = (
         name="min_clearance_m",
         text="smallest true distance to an obstacle's centre",
         unit="m",
-        of=lambda summary: summary["obstacles"]["min_clearance_m"],
+        of=lambda summary: summary["obstacles"]["nearest_m"],
         over_seeds=min,
     ),
     Figure(

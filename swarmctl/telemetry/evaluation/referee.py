@@ -249,8 +249,9 @@ def _unseen(clocked: ClockedTicks, agents: int, clock: _MissionClock) -> Iterato
 def _evaluate_obstacles(
     tracks: Tracks, rules: Rules, clock: _MissionClock
 ) -> tuple[dict[str, float | None], list[str]]:
-    """Return distance and required distance to the centre (axis of a column) of the obstacle with the least margin."""
+    """Find the distance to the centre (axis of a column) of the obstacle with the least margin, and to the nearest."""
     worst: tuple[float, float] | None = None  # (distance, required) with the least margin
+    nearest_m = math.inf
     violations = []
     for judged in rules.obstacles:
         obstacle, until_utc_us = judged.obstacle, judged.until_utc_us
@@ -267,6 +268,7 @@ def _evaluate_obstacles(
             if nearest is None:
                 continue
             least_m, instant = nearest
+            nearest_m = min(nearest_m, least_m)
             if worst is None or least_m - required_m < worst[0] - worst[1]:
                 worst = (least_m, required_m)
             if least_m < required_m:
@@ -275,7 +277,8 @@ def _evaluate_obstacles(
                     f"between agent {agent} and obstacle {judged.number} at {clock.at_s(tracks.t_us[instant]):.1f} s"
                 )
     distance, required = worst or (None, None)
-    return {"min_clearance_m": distance, "required_m": required}, _shorten(violations)
+    figures = {"min_clearance_m": distance, "required_m": required, "nearest_m": finite(nearest_m)}
+    return figures, _shorten(violations)
 
 
 def _evaluate_volume(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sitl.studies.sweep.figures import FIGURES
 from swarmctl.core.flight_volume import FlightVolume, VolumeParams
 from swarmctl.core.json_safe import to_json
 from swarmctl.core.obstacle import Obstacle
@@ -257,9 +258,21 @@ def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bo
         obstacle_margin_m=margin_m,
     )
     summary = evaluate(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
-    assert summary["obstacles"] == {"min_clearance_m": 1.5, "required_m": 1.75 - margin_m}
+    assert summary["obstacles"] == {"min_clearance_m": 1.5, "required_m": 1.75 - margin_m, "nearest_m": 1.5}
     assert (summary["outcome"] == "failed") == violated
     assert any("between agent 0 and obstacle 0" in text for text in summary["violations"]) == violated
+
+
+def test_the_nearest_obstacle_need_not_be_the_one_with_the_least_margin() -> None:
+    small = Obstacle(center_ned_m=(0.6, 0.0, 0.0), radius_m=0.2, keep_out_m=0.5)
+    large = Obstacle(center_ned_m=(3.05, 0.0, 0.0), radius_m=1.0, keep_out_m=3.0, visibility_m=5.0)
+    judged = tuple(JudgedObstacle(number=i, obstacle=obstacle) for i, obstacle in enumerate((small, large)))
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles=judged, obstacle_margin_m=0.0)
+    summary = evaluate(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
+    found = {"min_clearance_m": pytest.approx(3.05), "required_m": 3.0, "nearest_m": pytest.approx(0.6)}
+    assert summary["obstacles"] == found
+    (clearance,) = (figure for figure in FIGURES if figure.name == "min_clearance_m")
+    assert clearance.of(summary) == pytest.approx(0.6), "a sweep's smallest distance to a centre"
 
 
 @pytest.mark.parametrize(("column", "clearance_m"), [(True, 1.5), (False, 2.5)])
@@ -715,7 +728,7 @@ def test_summary_holds_no_nan_and_every_contract_key(data: RunData) -> None:
     again = json.loads(to_json(summary), parse_constant=refuse)
     assert {"outcome", "violations", "agents", "duration_s", "mode"} <= set(again)
     assert set(again["separation"]) >= {"min_m", "required_m"}
-    assert set(again["obstacles"]) == {"min_clearance_m", "required_m"}
+    assert set(again["obstacles"]) == {"min_clearance_m", "required_m", "nearest_m"}
     counted = {"ticks", "due_ticks", "late_ticks", "worst_agent"}
     assert set(again["timing"]) == counted | {"tick_ms", "solve_ms", "speed_factor"}
     assert set(again["solver"]) >= {"name", "failed", "max_residual_m"}
