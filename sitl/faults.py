@@ -1,6 +1,7 @@
 """Faults: the effect of each kind on a world at its begin and its end.
 
-A fault replaces an earlier one of the same kind on the same vehicle (and rotor). All times are simulated.
+A fault replaces an earlier one of the same kind on the same vehicle (and rotor, and direction of its links). Where the
+directions of two overlap, the newer one acts, and what still runs when it ends acts again. All times are simulated.
 """
 
 from __future__ import annotations
@@ -120,6 +121,7 @@ _BEGIN: dict[str, Callable[[FaultTarget, int, FaultParams, int], Undo]] = {
     "reboot": _reboot,
 }
 _ADD_UP = frozenset({"estimator_jump", "gust", "wind"})
+_OF_LINKS = frozenset(kind for kind in _BEGIN if kind.startswith("link_"))
 
 
 class Faults:
@@ -144,7 +146,7 @@ class Faults:
         for key, (end_us, fault, vehicle, undo) in list(self._running.items()):
             if now_us >= end_us:
                 del self._running[key]
-                undo()
+                self._end(fault, vehicle, undo, now_us)
                 self._tell("fault_ended", now_us, fault, vehicle)
         while self._waiting and self._waiting[0].at_s * 1e6 <= now_us:
             self._begin(self._waiting.pop(0), now_us)
@@ -162,11 +164,19 @@ class Faults:
                 key = (*key, now_us, len(self._running))
             before = self._running.pop(key, None)
             if before is not None:
-                before[3]()
+                self._end(*before[1:], now_us)
             undo = _BEGIN[fault.kind](self._world, vehicle, fault, now_us)
             if fault.for_s:
                 self._running[key] = (now_us + round(fault.for_s * 1e6), fault, vehicle, undo)
             self._tell("fault_began", now_us, fault, vehicle)
+
+    def _end(self, fault: FaultParams, vehicle: int, undo: Undo, now_us: int) -> None:
+        """End a fault that no longer runs; others that act on some of the same links go on."""
+        undo()
+        if fault.kind in _OF_LINKS:
+            for _, other, its_vehicle, _ in self._running.values():
+                if (other.kind, its_vehicle) == (fault.kind, vehicle):
+                    _BEGIN[other.kind](self._world, vehicle, other, now_us)
 
     def _earliest_us(self) -> int:
         ends = [end_us for end_us, *_ in self._running.values()]

@@ -246,6 +246,25 @@ def test_a_newer_fault_of_a_kind_replaces_the_older(flown: FlownWorld) -> None:
     assert flown.world.physics.rotor_health_01[0, 0] == 1.0
 
 
+@pytest.mark.parametrize("long_first", [True, False])
+def test_the_end_of_a_loss_in_one_direction_does_not_end_that_in_both(flown: FlownWorld, long_first: bool) -> None:
+    """From 0.8 s until 2 s, whichever of the two began first."""
+    link = flown.world.links_of(0)[0]
+
+    def losses_01() -> tuple[float, float]:
+        return link.to_vehicle.impairments.loss_01, link.from_vehicle.impairments.loss_01
+
+    both, one = {"for_s": 2.0}, {"for_s": 0.8, "value": 0.5, "direction": "to_vehicle"}
+    for fault in (both, one) if long_first else (one, both):
+        begin(flown, kind="link_loss", **fault)
+    flown.step(0.5)
+    assert losses_01() == ((0.5, 1.0) if long_first else (1.0, 1.0)), "the newer one acts"
+    flown.step(0.5)
+    assert losses_01() == (1.0, 1.0)
+    flown.step(1.1)
+    assert losses_01() == (0.0, 0.0)
+
+
 def test_scheduled_faults_happen_at_their_time_and_are_logged() -> None:
     faults = [
         {"kind": "motor", "at_s": 0.5, "value": 0.5, "for_s": 0.25},
