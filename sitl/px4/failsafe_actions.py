@@ -20,7 +20,7 @@ from sitl.px4.modes import FLIES_BLIND, OffboardLoss, Px4Mode
 from sitl.px4.parameters import Parameters
 
 RESUME_US = 20_000  # from a resumed stream to OFFBOARD, before the next tick
-_LOSS_ACTIONS = {  # others need a pilot, or are Return
+_LOSS_ACTIONS: dict[int, Action] = {  # others need a pilot, or are Return
     OffboardLoss.LAND: Action.LAND,
     OffboardLoss.HOLD: Action.HOLD,
     OffboardLoss.TERMINATE: Action.TERMINATE,
@@ -143,10 +143,7 @@ class FailsafeActions:
         self._kept[cause] = action
 
     def _loss_action(self) -> Action:
-        action = self._pilot.parameters.integer("COM_OBL_RC_ACT")
-        return (
-            _LOSS_ACTIONS.get(OffboardLoss(action), Action.RETURN) if action in tuple(OffboardLoss) else Action.RETURN
-        )
+        return _LOSS_ACTIONS.get(self._pilot.parameters.integer("COM_OBL_RC_ACT"), Action.RETURN)
 
     def _fly(self, now_us: int) -> None:
         """Do what the most severe action asks for, or return to the commanded mode when none is left."""
