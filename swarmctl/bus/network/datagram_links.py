@@ -82,7 +82,6 @@ class DatagramLinks:
         self._publishers: dict[str, MarkedPublisher] = {}
         self._ends = threading.Event()
         self._told_s, self._told = time.monotonic(), 0
-        self._missed, self._looked_s = MissedLinks(), time.monotonic()
         subscribers = [
             session.declare_subscriber(
                 f"{_PREFIX}*/*/{topic.name}",
@@ -97,7 +96,8 @@ class DatagramLinks:
             threading.Thread(target=self._send_from, args=(subscriber,), name="datagrams sent", daemon=True)
             for subscriber in subscribers
         ]
-        for thread in (self._receiver, *self._senders):
+        looker = threading.Thread(target=self._tell_missed, name="links", daemon=True)
+        for thread in (self._receiver, *self._senders, looker):
             thread.start()
 
     def close(self) -> None:
@@ -146,7 +146,6 @@ class DatagramLinks:
                     outgoing = self._routes.beat(now_s)
                 self._send_all(outgoing)
                 self._tell_refused(now_s)
-                self._tell_missed(now_s)
             self._receive()
 
     def _receive(self) -> None:
@@ -170,16 +169,18 @@ class DatagramLinks:
                 publisher = self._publishers[key] = MarkedPublisher(self._session, key, reliable=False)
             publisher.put(payload)
 
-    def _tell_missed(self, now_s: float) -> None:
-        if now_s - self._looked_s < _LOOKED_EVERY_S:
-            return
-        self._looked_s = now_s
-        with contextlib.suppress(zenoh.ZError):  # the session is being closed
-            certified = [str(link.auth_identifier) for link in self._session.info.links()]
-            linked = {name.rpartition(".")[0] for name in certified}
+    def _tell_missed(self) -> None:
+        """Look at the links, in a thread of its own: where Zenoh takes its time for that, no datagram waits."""
+        missed = MissedLinks()
+        while not self._ends.wait(_LOOKED_EVERY_S):
+            try:
+                certified = [str(link.auth_identifier) for link in self._session.info.links()]
+            except zenoh.ZError:
+                return  # the session is closed
+            now_s = time.monotonic()
             with self._lock:
                 heard = self._routes.heard(now_s)
-            for name in self._missed.update(heard, linked, now_s):
+            for name in missed.update(heard, {name.rpartition(".")[0] for name in certified}, now_s):
                 print(
                     f"{name}: its datagrams come, and for {_MISSED_S:g} s no link, so no orders, events and lists of "
                     "obstacles. Let UDP at the port of the host's address pass, and compare the identities of both",
