@@ -100,9 +100,7 @@ class Predictor:
     def __init__(self, params: VehicleModelParams) -> None:
         self._delay_us = round(params.delay_s * 1e6)
         self._lag, self._drag_1_s = params.lag(), params.drag_1_s
-        self._sent: deque[tuple[int, Array]] = deque(
-            maxlen=_REMEMBERED
-        )  # time from which it acts, virtual controls (3,)
+        self._sent = deque[tuple[int, Array]](maxlen=_REMEMBERED)  # time from which it acts, virtual controls (3,)
 
     @property
     def delay_us(self) -> int:
@@ -116,15 +114,6 @@ class Predictor:
     def clear(self) -> None:
         """Forget remembered commands, after a handover."""
         self._sent.clear()
-
-    def acting(self, t_us: int) -> Array | None:
-        """Return the virtual controls (3,) that act at `t_us`; None before the first."""
-        acting = None
-        for start_us, virtual_control in self._sent:
-            if start_us > t_us:
-                break
-            acting = virtual_control
-        return acting
 
     def start(self, state: VehicleState, until_us: int, disturbance_ned_m_s2: Array, held: Array) -> Start:
         """Return the start of a plan that acts from `until_us` on, after `held` (3,) was commanded last.

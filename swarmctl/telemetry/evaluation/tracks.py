@@ -49,9 +49,8 @@ class Tracks:
         least_m = float(lengths_m[instant])
         if self.time_field == "t_us":
             step_m = float(np.fmax.reduce(np.abs(np.diff(apart_m, axis=0)), axis=None, initial=0.0))
-            reach_m = (
-                least_m + 0.5 * math.sqrt(apart_m.shape[1]) * step_m
-            )  # nobody beyond it comes nearer in half a step
+            # nobody who is farther away comes nearer in half a step:
+            reach_m = least_m + 0.5 * math.sqrt(apart_m.shape[1]) * step_m
             near = np.fmin(lengths_m[:-1], lengths_m[1:]) <= reach_m
             later = np.flatnonzero(near & (np.diff(self.t_us) <= _AT_ONCE_US)) + 1
             between_m = closest_m(apart_m[later - 1], apart_m[later])
