@@ -117,7 +117,7 @@ def make_world_model(setup: AgentSetup, ports: Ports) -> WorldModel:
         ports.bus,
         utc_us=ports.clock.utc_us,
         rate_hz=setup.params.rate_hz,
-        heartbeat_s=setup.params.path_sharing.heartbeat_s,
+        path_s=setup.params.path_sharing.longest_s(setup.params.rate_hz),
         note=ports.note,
         vouchers=setup.vouchers,
         quorum=setup.quorum,

@@ -55,6 +55,7 @@ class Bench:
             self.bus,
             utc_us=self.clock.utc_us,
             rate_hz=rate_hz,
+            path_s=1.0 / rate_hz,
             note=lambda *_, **__: None,
             vouchers={},
             quorum=1,

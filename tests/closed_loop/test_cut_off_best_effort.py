@@ -15,6 +15,7 @@ from swarmctl.config import load
 from swarmctl.control.collision.barrier import Barrier
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.control.phases.trajectories import Trajectories
+from swarmctl.control.reference.quintic import brake_to_rest
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array, Phase, VehicleState
 from swarmctl.simulator_config import EVERY_VEHICLE, FaultParams
@@ -183,16 +184,13 @@ def returning_for(seconds: float) -> Callable[[Lockstep], bool]:
 
 def softly(now: Trajectories, now_us: int, state: VehicleState, **_: object) -> None:
     """Brake to rest as softly in a pause as transits do."""
-    stops(now, now_us, state)
+    now._begin(brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, now._accel_m_s2), now_us)
 
 
 def home_at_once(now: MissionState, now_us: int, state: VehicleState) -> None:
     """Fly home, whoever is silent."""
     now.landing.go_home(now_us, state)
     now._begin_landing(now_us)
-
-
-stops = Trajectories.stop
 
 
 @pytest.mark.parametrize("seed", [0, 1])

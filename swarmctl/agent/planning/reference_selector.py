@@ -42,9 +42,12 @@ class ReferenceSelector:
     def followed_z_m(self) -> float:
         """Return the down coordinate now of what the agent follows: its mission, or what interrupts it.
 
-        A commitment is left out: a vehicle that sinks commits anew from where it is.
+        On the way back it is the mission's own, for that way begins where the vehicle may have sunk to. Commitments are
+        left out likewise: a vehicle that sinks commits anew from where it is.
         """
-        return float(self._mission_ned[0][0, 2])
+        goes_back = self._left_ned is not None and self._mission.follows_mission
+        pos, _ = self._left_ned if goes_back and self._left_ned is not None else self._mission_ned
+        return float(pos[0, 2])
 
     def heading_rad(self, utc_us: int) -> float | None:
         """Return the heading [rad] to turn to: the operator's, the mission's while it is followed, or that of the

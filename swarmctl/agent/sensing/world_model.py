@@ -32,7 +32,7 @@ from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Array, Phase, PredictedPath
 
-_EXPECTED_TICKS = 3  # after which a path is late that has not come; its peer may fly another one
+_EXPECTED_TICKS, _EXPECTED_S = 3, 0.16  # after which a path is late, at the least; its peer may fly another one
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 
 
@@ -45,7 +45,7 @@ class WorldModel:
         params: distances and ages.
         bus: source of messages, drained by `receive`.
         utc_us: the own clock, by which messages arrive.
-        rate_hz, heartbeat_s: tick rate of every agent, and how long its paths are apart at most.
+        rate_hz, path_s: tick rate of every agent, and how long its paths are apart at most.
         vouchers: agents of which each sender may say that they have ended.
         quorum: see `AgentSetup`.
         model: of the own vehicle; those of peers are taken for such ones.
@@ -68,7 +68,7 @@ class WorldModel:
         *,
         utc_us: Callable[[], int],
         rate_hz: float,
-        heartbeat_s: float = 0.1,
+        path_s: float,
         note: Callable[..., None],
         vouchers: Mapping[str, Set[int]],
         quorum: int,
@@ -79,7 +79,7 @@ class WorldModel:
         self._peers, self._quorum, self._utc_us = peers, quorum, utc_us
         self._model, self._loss_s = model, loss_s
         self._budget = params.budget
-        self._expected_us = round(1e6 * (heartbeat_s + _EXPECTED_TICKS / rate_hz))
+        self._expected_us = round(1e6 * max(_EXPECTED_S, path_s + _EXPECTED_TICKS / rate_hz))
         self.refusals, self.presence = Refusals(note), Presence(bus)
         self.clocks = PeerClocks(peers, note, trusts_equal=params.mode == "best_effort")
         self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence, clocks=self.clocks)

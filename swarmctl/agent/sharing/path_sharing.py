@@ -23,6 +23,10 @@ class PathSharingParams(Params):
     speed_m_s: float = Field(3.0, gt=0, le=50)  # that those out of reach count on; faster ones tell them at once
     compact: bool = False  # a third of the bytes, for radio links: points are rounded, by less than a millimetre
 
+    def longest_s(self, rate_hz: float) -> float:
+        """Return how long the paths of an agent are apart at most, at this tick rate."""
+        return max(1.0 / rate_hz, self.heartbeat_s if self.error_m else 0.0)
+
 
 class _Shared(NamedTuple):
     """A path that was published."""

@@ -15,6 +15,7 @@ import pytest
 
 from swarmctl.agent.sensing.peer_statuses import PeerStatuses
 from swarmctl.agent.sensing.world_model import WorldModel
+from swarmctl.agent.sharing.path_sharing import PathSharingParams
 from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.local.hub import LocalHub
@@ -57,7 +58,7 @@ class Bench:
     seq: int = 0
     quorum: int = 1
     rate_hz: float = 50.0
-    heartbeat_s: float = 0.1
+    path_s: float = 0.02
     connect: Callable[[LocalHub, str], Bus] = LocalHub.connect
 
     def __post_init__(self) -> None:
@@ -73,7 +74,7 @@ class Bench:
             self.bus,
             utc_us=self.clock.utc_us,
             rate_hz=self.rate_hz,
-            heartbeat_s=self.heartbeat_s,
+            path_s=self.path_s,
             note=note,
             vouchers=vouchers,
             quorum=self.quorum,
@@ -843,16 +844,28 @@ def test_only_vehicles_that_agents_fly_miss_their_setpoints(mode: Mode, agents: 
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "heartbeat_s", "age_s", "ways"),
-    [(50.0, 0.1, 0.14, 1), (50.0, 0.1, 0.18, 2), (50.0, 0.25, 0.3, 1), (10.0, 0.1, 0.3, 1), (10.0, 0.1, 0.42, 2)],
+    ("rate_hz", "path_s", "age_s", "ways"),
+    [
+        (50.0, 0.02, 0.14, 1),
+        (50.0, 0.02, 0.18, 2),
+        (25.0, 0.04, 0.18, 2),
+        (50.0, 0.25, 0.3, 1),
+        (10.0, 0.1, 0.38, 1),
+        (10.0, 0.1, 0.42, 2),
+    ],
 )
 def test_a_peer_is_expected_without_setpoints_too_once_its_path_is_late(
-    rate_hz: float, heartbeat_s: float, age_s: float, ways: int
+    rate_hz: float, path_s: float, age_s: float, ways: int
 ) -> None:
-    bench = Bench(rate_hz=rate_hz, heartbeat_s=heartbeat_s)
+    bench = Bench(rate_hz=rate_hz, path_s=path_s)
     bench.say_path()
     bench.say_status(mode=Mode.TRACKING, phase=Phase.TRACK)
     bench.tick()
     bench.clock.advance(round(1e6 * age_s) - TICK_US)
     (path,) = bench.world_model.paths.latest()
     assert len(bench.world_model._ways(path, bench.clock.utc_us())) == ways
+
+
+@pytest.mark.parametrize(("error_m", "longest_s"), [(0.0, 0.1), (0.02, 0.25)])
+def test_only_event_triggered_paths_are_apart_by_the_heartbeat(error_m: float, longest_s: float) -> None:
+    assert PathSharingParams(error_m=error_m, heartbeat_s=0.25).longest_s(10.0) == longest_s

@@ -111,6 +111,7 @@ class Scene:
             self.bus,
             utc_us=lambda: self.now_us,
             rate_hz=RATE_HZ,
+            path_s=0.02,
             note=lambda *_, **__: None,
             vouchers=vouchers,
             quorum=1,
