@@ -24,6 +24,7 @@ from sitl.studies.campaign.summary import Share, summaries
 from sitl.studies.campaign.trials import Cell, Row, Trial, trial_of
 from swarmctl.core.types import Phase
 from swarmctl.telemetry.recording.file_names import STUDY_ROWS
+from tests.benches.guaranteed_trials import GUARANTEED_SWAP
 
 ROOT = Path(__file__).parents[2]
 SHOWN = "    swarmctl campaign "
@@ -109,32 +110,15 @@ def test_scenario_events_happen_in_flight() -> None:
 
 
 def test_a_disturbance_of_every_vehicle_has_a_flight_alone_to_compare_with() -> None:
-    cell = Cell(
-        scenario="random",
-        agents=2,
-        delay_ms=0.0,
-        loss=0.0,
-        noise="exact",
-        wind_m_s=0.0,
-        protections="default",
-        disturbance="masses",  # settings that name both vehicles
-    )
+    both_named = "masses"  # settings that name both vehicles
+    cell = replace(GUARANTEED_SWAP, scenario="random", agents=2, protections="default", disturbance=both_named)
     row = fly(Trial(cell, 1))
     assert row["outcome"] == "arrived"
     assert 2.0 < row["unconstrained_time_s"] < 8.0
 
 
 def test_two_halves_that_stay_apart_stop_and_are_not_asked_to_arrive() -> None:
-    cell = Cell(
-        scenario="swap",
-        agents=2,
-        delay_ms=0.0,
-        loss=0.0,
-        noise="exact",
-        wind_m_s=0.0,
-        protections="guaranteed",
-        disturbance="split:0",
-    )
+    cell = replace(GUARANTEED_SWAP, agents=2, disturbance="split:0")
     flight = TrialFlight(Trial(cell, 1), replace(drawn(cell, 1), limit_s=14.0))
     flight.run()
     row = flight.row(None) | {"cpu_s": 0.0}

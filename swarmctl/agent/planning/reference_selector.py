@@ -45,8 +45,8 @@ class ReferenceSelector:
         On the way back it is the mission's own, for that way begins where the vehicle may have sunk to. Commitments are
         left out likewise: a vehicle that sinks commits anew from where it is.
         """
-        goes_back = self._left_ned is not None and self._mission.follows_mission
-        pos, _ = self._left_ned if goes_back and self._left_ned is not None else self._mission_ned
+        left_ned = self._left_ned if self._mission.follows_mission else None  # on the way back
+        pos, _ = left_ned or self._mission_ned
         return float(pos[0, 2])
 
     def heading_rad(self, utc_us: int) -> float | None:

@@ -19,13 +19,13 @@ from swarmctl.control.phases.mission_state import PLAN_MODES, MissionSetup, Miss
 from swarmctl.control.phases.refused_orders import OrderSituation, refusal_of
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.phases.steps import ascent, descent, on_ground, tracking
+from swarmctl.control.phases.trajectories import TRANSIT_HEIGHT_M
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
 from swarmctl.core.types import Command, FlightMode, Mode, Phase, VehicleState
 
 _LATE_US, _AWAY_M = 200_000, 0.5  # from its begin and from the start, from which on its reference is approached
 _KEEPS_UP_01 = 0.15  # of deadlines missed
-_LEAST_HEIGHT_M = 0.5  # above the ground, of a point to go to
 REBOOTED = "the autopilot rebooted"
 OVERLOADED = "overload: deadlines were missed for too long"
 
@@ -127,7 +127,7 @@ class MissionStateMachine:
     ) -> OrderSituation:
         mission = self.mission
         # the ground's height is known after a take-off
-        lowest_m = float(mission.start_ned_m[2]) if mission.airborne else mission.climb.ground_z_m - _LEAST_HEIGHT_M
+        lowest_m = float(mission.start_ned_m[2]) if mission.airborne else mission.climb.ground_z_m - TRANSIT_HEIGHT_M
         return OrderSituation(
             phase=mission.phase,
             state=state,

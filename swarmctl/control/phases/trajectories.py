@@ -15,7 +15,7 @@ from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest,
 from swarmctl.core.types import Array, VehicleState
 
 _WAY_POINTS = 300  # of a way that is checked
-_LEAST_HEIGHT_M = 0.5  # above the ground, to which a vehicle may be carried as it stops or turns round
+TRANSIT_HEIGHT_M = 0.5  # least above the ground, of a point to go to, and as a vehicle stops or turns round
 _LOWER_M = 0.1  # by which one that flies lower than that may sink: it need not brake hard for a swaying
 _HARDER = 8  # decelerations that are tried, from that of transits up, until one keeps above the ground
 _LOW_POINTS = 60  # of a way whose lowest point is looked for
@@ -182,7 +182,7 @@ class Trajectories:
     def _lowest_m(self, state: VehicleState) -> float:
         """Return the down coordinate to which a vehicle may be carried; one that is lower already, hardly lower."""
         low_m = float(state.pos_ned_m[2]) + _LOWER_M
-        return low_m if self.ground_z_m is None else max(self.ground_z_m - _LEAST_HEIGHT_M, low_m)
+        return low_m if self.ground_z_m is None else max(self.ground_z_m - TRANSIT_HEIGHT_M, low_m)
 
     def _above_ground(
         self,
