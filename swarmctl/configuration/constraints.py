@@ -154,24 +154,32 @@ def planned_braking_problems(
     """
     mpc, limits = controller.mpc, f"controller.mpc.u_max = {controller.mpc.u_max:g} and thrust allow"
     most_m_s2 = min(mpc.accel_max_m_s2(model) for model in models)
+    vertical_m_s2, left = _beside_weight(models, controller)
     if separation.mode == "guaranteed":
         committed_m_s2 = min(planning(mpc, agent.commit, model).accel_max_m_s2(model) for model in models)
         share = f"agent.commit.tilt_fraction_01 = {agent.commit.tilt_fraction_01:g} of {limits}"
         yield from _beyond("agent.commit.brake_m_s2", agent.commit.brake_m_s2, committed_m_s2, share)
     if controller.plans or not (controller.is_own or controller.follows_reference):
         yield from _beyond("agent.state_machine.accel_m_s2", agent.state_machine.accel_m_s2, most_m_s2, limits)
+        yield from _beyond("agent.state_machine.accel_m_s2", agent.state_machine.accel_m_s2, vertical_m_s2, left)
+    if controller.plans:
+        yield from _beyond("separation.stop_m_s2", separation.stop_m_s2, most_m_s2, limits)
     if not volume.corners_ne_m:
         return
     if controller.is_own:
         most_m_s2 = _tilted_m_s2(models)
         limits = "vehicle_model.tilt_max_rad allows"
     yield from _beyond("volume.brake_m_s2", volume.brake_m_s2, most_m_s2, limits)
-    ranges_m_s2 = [model.thrust_range_m_s2() for model in models]
+    yield from _beyond("volume.brake_z_m_s2", volume.brake_z_m_s2, vertical_m_s2, left)
+
+
+def _beside_weight(models: Sequence[VehicleModelParams], controller: ControllerParams) -> tuple[float, str]:
+    """Return the least vertical acceleration, up or down, that thrust has in level flight, and by which bounds."""
+    mpc, ranges_m_s2 = controller.mpc, [model.thrust_range_m_s2() for model in models]
     ranges_m_s2 += [] if controller.is_own else [(mpc.thrust_min_m_s2, mpc.thrust_max_m_s2)]
     rises_m_s2 = min(most for _, most in ranges_m_s2) - GRAVITY_M_S2
     falls_m_s2 = GRAVITY_M_S2 - max(least for least, _ in ranges_m_s2)
-    left = "thrust (vehicle_model, controller.mpc) leaves beside the weight"
-    yield from _beyond("volume.brake_z_m_s2", volume.brake_z_m_s2, min(rises_m_s2, falls_m_s2), left)
+    return min(rises_m_s2, falls_m_s2), "thrust (vehicle_model, controller.mpc) leaves beside the weight"
 
 
 def _tilted_m_s2(models: Sequence[VehicleModelParams]) -> float:

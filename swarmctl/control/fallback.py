@@ -17,11 +17,18 @@ _TILT_RATE_1_S = 2.5  # of (u_x, u_y): faster attitude changes would saturate ro
 
 
 def brake_and_hold_plan(
-    start: Start, at_ned_m: Array | None, disturbance_ned_m_s2: Array, lag: Lag | None, *, dt_us: int, steps: int
+    start: Start,
+    at_ned_m: Array | None,
+    disturbance_ned_m_s2: Array,
+    lag: Lag | None,
+    *,
+    drag_1_s: float,
+    dt_us: int,
+    steps: int,
 ) -> Plan:
     """Brake, or return to `at_ned_m` (3,) if given, like a critically damped spring of bounded acceleration.
 
-    The path is the motion this law gives a vehicle with that `lag`, so that peers can keep clear of it.
+    The path is the motion that this law gives a vehicle with that lag and drag, so that peers can keep clear of it.
     """
     dt_s = dt_us * 1e-6
     damping = _DAMPING_1_S if lag is None else min(_DAMPING_1_S, _DAMPING_RAD / lag.ramp_delay_s)
@@ -35,7 +42,8 @@ def brake_and_hold_plan(
         if at_ned_m is not None:
             wanted = wanted + stiffness * (at_ned_m - pos[k])
         accel = np.clip(wanted, -_ACCEL_MAX_M_S2, _ACCEL_MAX_M_S2)
-        thrust_vector = GRAVITY_NED_M_S2 + disturbance_ned_m_s2 - accel  # thrust vector over mass, up positive
+        pushed = disturbance_ned_m_s2 - drag_1_s * vel[k]
+        thrust_vector = GRAVITY_NED_M_S2 + pushed - accel  # thrust vector over mass, up positive
         slew = _TILT_RATE_1_S * dt_s
         u = np.clip(
             thrust_vector[:2] / float(np.sqrt(thrust_vector @ thrust_vector)), commanded - slew, commanded + slew
@@ -48,7 +56,7 @@ def brake_and_hold_plan(
             ends = [lag.advance(float(tilt[i]), float(rate[i]), float(u[i]), dt_s) for i in (0, 1)]
             tilt, rate = np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
             acts = np.array([ends[0][2], ends[1][2]]) / dt_s
-        accel[:2] = disturbance_ned_m_s2[:2] - thrust * acts
+        accel[:2] = pushed[:2] - thrust * acts
         pos[k + 1] = pos[k] + dt_s * vel[k] + 0.5 * dt_s * dt_s * accel
         vel[k + 1] = vel[k] + dt_s * accel
     return Plan(

@@ -1,4 +1,4 @@
-"""Who is away from its reference approaches it at `vehicle_model.speed_max_m_s` at most.
+"""Who is away from its reference approaches it at `vehicle_model.speed_max_m_s` at most, and sinks as it can brake.
 
 From rest a plan makes up for the time lost: it exceeds that by up to a tenth for a moment, and settles at it.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from swarmctl.agent.planning import reference_selector
 from swarmctl.core.types import Phase
 from tests.closed_loop.conftest import Flight, Fly
 from tests.closed_loop.test_operator import phase
@@ -44,3 +45,29 @@ def test_a_reference_far_away_is_approached_no_faster_than_allowed(fly: Fly, mod
 
 def test_negative_control_without_that_limit_it_is_flown_to_as_fast_as_tilt_allows(fly: Fly) -> None:
     assert fastest_m_s(fly_there(fly, 100.0, "best_effort")) > 2.0 * SPEED_M_S
+
+
+def lowest_m(fly: Fly) -> float:
+    """Fly to 3 m above the ground from 15 m with a quarter of the weight to brake with; return the least height."""
+    flight = fly(
+        "swarm.agents=1",
+        "sitl.start=air",
+        "start.positions_ned_m=[[0,0,-15]]",
+        "mission.kind=waypoints",
+        "mission.duration_s=10",
+        "mission.waypoints.lists=[{points_ned_m=[[0,0,-3],[0,0.5,-3]]}]",
+        "vehicle_model.thrust_max_01=0.625",
+        until=lambda running: phase(running) > Phase.TRACK,
+    )
+    return float(-flight.pos_ned_m[:, 0, 2].max())
+
+
+def test_who_is_sent_far_down_brakes_with_what_thrust_is_left_beside_the_weight(fly: Fly) -> None:
+    assert lowest_m(fly) > 2.5
+
+
+def test_negative_control_without_a_limit_of_sinking_it_falls_into_the_ground(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reference_selector, "sink_max_m_s", lambda _: 100.0)
+    assert lowest_m(fly) < 0.0

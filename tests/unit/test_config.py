@@ -379,7 +379,7 @@ BRAKES = (
 
 @pytest.mark.parametrize("key", BRAKES)
 def test_braking_that_tilt_does_not_give_is_refused(key: str) -> None:
-    hovering = ["mission.kind=hover", "vehicle_model.tilt_max_rad=0.1"]
+    hovering = ["mission.kind=hover", "vehicle_model.tilt_max_rad=0.1", "separation.stop_m_s2=0.9"]
     hovering += [f"{other}=0.9" for other in BRAKES if other != key]
     with pytest.raises(ConfigError, match=re.escape(f"{key} = 1.1: more than the 0.98 m/s2")):
         load(None, [*hovering, f"{key}=1.1"])
@@ -400,6 +400,8 @@ HEAVY = (*VOLUME, "vehicle_model.hover_thrust_01=0.8")
     [
         ((), "agent.state_machine.accel_m_s2", "2.00", "2.1"),
         (("controller.kind=open_loop",), "agent.state_machine.accel_m_s2", "2.00", "2.1"),
+        ((), "separation.stop_m_s2", "2.00", "2.1"),
+        (("vehicle_model.hover_thrust_01=0.9",), "agent.state_machine.accel_m_s2", "1.09", "1.2"),
         (VOLUME, "volume.brake_m_s2", "2.00", "6"),
         ((*VOLUME, "controller.kind=dmpc3"), "volume.brake_m_s2", "2.00", "6"),
         (HEAVY, "volume.brake_z_m_s2", "2.45", "3"),
@@ -421,6 +423,7 @@ def test_braking_that_plans_do_not_have_is_refused(given: tuple[str, ...], key: 
         ("agent.commit.brake_m_s2=6",),  # nothing is committed to
         ("volume.brake_m_s2=20", "volume.brake_z_m_s2=20"),  # there is no volume
         ("controller.kind=pid", "agent.state_machine.accel_m_s2=5"),  # it tilts as far as the vehicle may
+        ("controller.kind=pid", "separation.stop_m_s2=5"),  # it does not plan
     ],
 )
 def test_braking_that_no_plan_relies_on_is_accepted(given: tuple[str, ...]) -> None:

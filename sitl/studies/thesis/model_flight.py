@@ -144,7 +144,17 @@ class Pilot:
 
     def _flown(self, plan: Plan, start: Start, keep_outs: tuple[KeepOut, ...]) -> Plan:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
-        stop = partial(brake_and_hold_plan, start, None, disturbance, None, dt_us=self._dt_us, steps=self._steps)
+        drag_1_s = self._config.vehicle_model.drag_1_s
+        stop = partial(
+            brake_and_hold_plan,
+            start,
+            None,
+            disturbance,
+            None,
+            drag_1_s=drag_1_s,
+            dt_us=self._dt_us,
+            steps=self._steps,
+        )
         self._plan_buffer.take(plan, start, keep_outs, stop)
         if plan.status is PlanStatus.OK:
             return plan

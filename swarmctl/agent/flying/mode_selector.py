@@ -55,7 +55,8 @@ class ModeSelector:
         alerts: Alerts,
         note: Callable[..., None],
     ) -> None:
-        self._params, self._lag, self._delay_us = setup.params.failsafe, setup.vehicle_model.lag(), delay_us
+        self._params, self._delay_us = setup.params.failsafe, delay_us
+        self._lag, self._drag_1_s = setup.vehicle_model.lag(), setup.vehicle_model.drag_1_s
         self._dt_us, self._steps = controller.dt_us, controller.steps
         self._mission, self._alerts, self._note = mission, alerts, note
         self._plan_buffer = PlanBuffer(
@@ -162,5 +163,11 @@ class ModeSelector:
 
     def _brake_and_hold(self, start: Start, disturbance_ned_m_s2: Array) -> Plan:
         return brake_and_hold_plan(
-            start, self._hold_at, disturbance_ned_m_s2, self._lag, dt_us=self._dt_us, steps=self._steps
+            start,
+            self._hold_at,
+            disturbance_ned_m_s2,
+            self._lag,
+            drag_1_s=self._drag_1_s,
+            dt_us=self._dt_us,
+            steps=self._steps,
         )

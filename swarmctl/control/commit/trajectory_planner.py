@@ -26,7 +26,7 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
-from swarmctl.control.reference.approach import approached
+from swarmctl.control.reference.approach import approached, sink_max_m_s
 from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_NED_M_S2
@@ -84,6 +84,7 @@ class TrajectoryPlanner:
         )
         bounded = planning(mpc, params, vehicle)
         self._hardest_m_s2 = bounded.accel_max_m_s2(vehicle)
+        self._sink_max_m_s = sink_max_m_s(bounded.most_thrust_m_s2(vehicle))
         self._interpolation_margin_m = interpolation_margin_m(mpc, params, vehicle)
         self._mpc = SwarmMpc(
             bounded,
@@ -262,7 +263,13 @@ class TrajectoryPlanner:
         """Return the desired reference at times after the plan's begin, approached from there as fast as allowed."""
         motion = now.desired.reference(1e-6 * (ahead_us + (now.begin_us - now.utc_us)))
         if not now.desired.follows_path:
-            motion = approached(*motion, 1e-6 * ahead_us, begin_ned_m, speed_max_m_s=self._speed_max_m_s)
+            motion = approached(
+                *motion,
+                1e-6 * ahead_us,
+                begin_ned_m,
+                speed_max_m_s=self._speed_max_m_s,
+                sink_max_m_s=self._sink_max_m_s,
+            )
         return Reference(*motion, 0.0)
 
     def _virtual_control(self, committed: Trajectory, now: Situation) -> Array:

@@ -31,7 +31,7 @@ def start(
 def brake(
     vel: tuple[float, ...], at: Array | None = None, wind: Array = NO_WIND, tilt: tuple[float, ...] = (0.0, 0.0)
 ) -> Plan:
-    return brake_and_hold_plan(start(vel, tilt=tilt), at, wind, None, dt_us=DT_US, steps=STEPS)
+    return brake_and_hold_plan(start(vel, tilt=tilt), at, wind, None, drag_1_s=0.0, dt_us=DT_US, steps=STEPS)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.5, 1.0, 2.5, 5.0])
@@ -125,7 +125,8 @@ def flown(
             tilt=tilt,
             tilt_rate_1_s=rate,
         )
-        virtual_control = brake_and_hold_plan(begin, at, NO_WIND, believed, dt_us=DT_US, steps=2).virtual_control[0]
+        plan = brake_and_hold_plan(begin, at, NO_WIND, believed, drag_1_s=0.0, dt_us=DT_US, steps=2)
+        virtual_control = plan.virtual_control[0]
         ends = [true.advance(float(tilt[i]), float(rate[i]), float(virtual_control[i]), DT_S) for i in (0, 1)]
         tilt, rate = np.array([e[0] for e in ends]), np.array([e[1] for e in ends])
         accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]]))
@@ -150,7 +151,8 @@ def test_the_damping_for_a_vehicle_without_lag_would_swing_a_slow_one() -> None:
     assert speeds[:, 0].min() < -0.5
 
 
-def test_the_published_path_is_the_one_a_lagging_vehicle_flies() -> None:
+@pytest.mark.parametrize("drag_1_s", [0.0, 0.8])
+def test_the_published_path_is_the_one_a_lagging_vehicle_flies(drag_1_s: float) -> None:
     begin = Start(
         t_us=0,
         pos_ned_m=np.zeros(3),
@@ -159,12 +161,12 @@ def test_the_published_path_is_the_one_a_lagging_vehicle_flies() -> None:
         virtual_control=np.array([0.1, 0.0, 9.81]),
         tilt=np.array([0.1, 0.0]),
     )
-    plan = brake_and_hold_plan(begin, None, NO_WIND, LAG, dt_us=DT_US, steps=STEPS)
+    plan = brake_and_hold_plan(begin, None, NO_WIND, LAG, drag_1_s=drag_1_s, dt_us=DT_US, steps=STEPS)
     pos, vel, tilt, rate = np.zeros(3), np.array([2.0, -1.0, 0.0]), np.array([0.1, 0.0]), np.zeros(2)
     for k, virtual_control in enumerate(plan.virtual_control):
         ends = [LAG.advance(float(tilt[i]), float(rate[i]), float(virtual_control[i]), DT_S) for i in (0, 1)]
         tilt, rate = np.array([e[0] for e in ends]), np.array([e[1] for e in ends])
-        accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]]))
+        accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]])) - drag_1_s * vel
         pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
         np.testing.assert_allclose(plan.pos_ned_m[k + 1, :2], pos[:2], atol=0.02)
 
@@ -173,6 +175,7 @@ def test_the_published_path_is_the_one_a_lagging_vehicle_flies() -> None:
 def test_a_plan_from_any_tilt_is_finite(tilt: tuple[float, float]) -> None:
     begin = start((0.0, 0.0, 0.0), tilt=tilt)
     for lag in (None, LAG):
-        plan = brake_and_hold_plan(begin, None, np.array([8.0, 8.0, 0.0]), lag, dt_us=50_000, steps=40)
+        wind_m_s2 = np.array([8.0, 8.0, 0.0])
+        plan = brake_and_hold_plan(begin, None, wind_m_s2, lag, drag_1_s=0.5, dt_us=50_000, steps=40)
         assert all(np.isfinite(values).all() for values in (plan.pos_ned_m, plan.vel_ned_m_s, plan.virtual_control))
         assert plan.virtual_control[:, 2].max() < 9.81 / 0.29
