@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from swarmctl.bus.messages.json_messages import StatusMessage
-from swarmctl.control.collision.separation import KeepOut, SeparationParams
+from swarmctl.control.collision.keep_outs import KeepOut
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.situation import DesiredReference, Situation
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.controller_setup import ControllerSetup

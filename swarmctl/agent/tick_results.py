@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import Array, AttitudeSetpoint, Mode, Plan, Reference
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarmctl.control.collision.separation import (
-    KeepOut,
-    SeparationParams,
-)
+from swarmctl.control.collision.keep_outs import KeepOut
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.types import Array, PredictedPath
 from tests import builders
 

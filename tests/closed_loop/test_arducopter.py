@@ -12,7 +12,8 @@ from sitl.arducopter.autopilot import ArduCopter
 from sitl.lockstep import Lockstep
 from swarmctl.agent.planning.non_participants import NonParticipants
 from swarmctl.agent.sensing import world_model
-from swarmctl.control.collision.separation import KeepOuts, without_setpoints
+from swarmctl.control.collision.keep_outs import KeepOuts
+from swarmctl.control.collision.separation import without_setpoints
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from tests.closed_loop.conftest import Flight, fly_now, mission_t_s
 

@@ -6,7 +6,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.agent.planning.separation_policy import Guaranteed
-from swarmctl.control.collision.separation import KeepOuts
+from swarmctl.control.collision.keep_outs import KeepOuts
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.commit.situation import Situation

@@ -22,7 +22,8 @@ from sitl.studies.protocol.symbols import (
     places_of,
     trajectory_of,
 )
-from swarmctl.control.collision.separation import KeepOuts, SeparationParams, keep_out_of_commitment
+from swarmctl.control.collision.keep_outs import KeepOuts
+from swarmctl.control.collision.separation import SeparationParams, keep_out_of_commitment
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import Commitments, acknowledgements

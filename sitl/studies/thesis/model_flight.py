@@ -17,7 +17,8 @@ from sitl.plant.attitude import THESIS_GAINS, THESIS_SAMPLE_S, ThesisAttitude
 from sitl.plant.vehicle import Plant
 from sitl.studies.thesis.trace import Array, Trace
 from swarmctl.config import Config
-from swarmctl.control.collision.separation import KeepOut, keep_out_of_obstacle, keep_out_of_peer, visible
+from swarmctl.control.collision.keep_outs import KeepOut
+from swarmctl.control.collision.separation import keep_out_of_obstacle, keep_out_of_peer, visible
 from swarmctl.control.controllers.discovery import make_controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.fallback import brake_and_hold_plan

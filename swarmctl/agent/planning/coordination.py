@@ -18,7 +18,8 @@ from swarmctl.bus import topics
 from swarmctl.bus.bus import Bus, agent_name
 from swarmctl.bus.peers.trajectories import PeerTrajectories
 from swarmctl.control.collision.encounters import Encounters
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
+from swarmctl.control.collision.keep_outs import KeepOut, KeepOuts
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments

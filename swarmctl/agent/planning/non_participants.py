@@ -9,7 +9,8 @@ import numpy as np
 
 from swarmctl.agent.sensing.world_model import WorldModel
 from swarmctl.control.collision.encounters import Encounters
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, keep_out_of_commitment
+from swarmctl.control.collision.keep_outs import KeepOut, KeepOuts
+from swarmctl.control.collision.separation import SeparationParams, keep_out_of_commitment
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Phase
 

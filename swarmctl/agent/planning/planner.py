@@ -19,7 +19,7 @@ from swarmctl.agent.tick_results import PlanningResult
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.agent.watches.volume_watch import VolumeWatch
 from swarmctl.control.collision.encounters import Encounters
-from swarmctl.control.collision.separation import KeepOuts
+from swarmctl.control.collision.keep_outs import KeepOuts
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.phases.mission_state import MissionState

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.control.reference.approach import approached, sink_max_m_s

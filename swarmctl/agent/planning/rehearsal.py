@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from swarmctl.agent.sensing.world_model import WorldModel
-from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOuts
+from swarmctl.control.collision.keep_outs import NO_KEEP_OUTS, KeepOuts
 from swarmctl.control.commit.situation import DesiredReference, Situation
 from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.controllers.kind import Controller

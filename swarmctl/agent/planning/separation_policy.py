@@ -13,7 +13,7 @@ from typing import Protocol
 from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.agent.planning.state_age import StateAge
 from swarmctl.agent.sensing.world_model import WorldModel
-from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOut, KeepOuts
+from swarmctl.control.collision.keep_outs import NO_KEEP_OUTS, KeepOut, KeepOuts
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.types import Array, Phase, Reference, VehicleState

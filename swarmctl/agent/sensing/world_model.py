@@ -18,8 +18,8 @@ from swarmctl.bus.peers.paths import PeerPaths
 from swarmctl.bus.peers.senders import Presence
 from swarmctl.bus.refusals import LATE, Refusals
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
+from swarmctl.control.collision.keep_outs import KeepOuts
 from swarmctl.control.collision.separation import (
-    KeepOuts,
     SeparationParams,
     aligned,
     keep_out_along,

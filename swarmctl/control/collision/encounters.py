@@ -11,7 +11,7 @@ import math
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
 
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, stacked
+from swarmctl.control.collision.keep_outs import KeepOut, KeepOuts, stacked
 from swarmctl.core.types import Array
 
 

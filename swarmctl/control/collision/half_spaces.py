@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, stacked
+from swarmctl.control.collision.keep_outs import KeepOut, KeepOuts, stacked
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.types import Array
 

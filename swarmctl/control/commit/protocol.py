@@ -77,7 +77,7 @@ from typing import Protocol
 
 import numpy as np
 
-from swarmctl.control.collision.separation import KeepOuts
+from swarmctl.control.collision.keep_outs import KeepOuts
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.situation import Situation
 from swarmctl.core.trajectory import Trajectory, by_exact_clock, delayed, resting

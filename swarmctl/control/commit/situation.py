@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from swarmctl.control.collision.separation import KeepOut, KeepOuts
-from swarmctl.core.trajectory import Trajectory, braking_displacement
+from swarmctl.control.collision.keep_outs import KeepOut
+from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Sampled
 
@@ -47,19 +47,6 @@ class Situation:
     def followed(self) -> list[Trajectory]:
         """Return all trajectories that peers may follow from now on."""
         return [trajectory for message in self.peers.values() for trajectory in message.followed]
-
-
-def lasting(keep_outs: Sequence[KeepOut], steps: int, dt_us: int, brake_m_s2: float) -> KeepOuts:
-    """Return keep-outs for so many steps more: obstacles move on as they do, vehicles brake to rest."""
-    dt_s, found = 1e-6 * dt_us, []
-    ahead_s = dt_s * np.arange(1, steps + 1, dtype=np.float64)
-    for keep_out in keep_outs:
-        pos = keep_out.pos_ned_m
-        vel = (pos[-1] - pos[-2]) / dt_s
-        is_obstacle = keep_out.priority_id < 0
-        way = ahead_s[:, None] * vel if is_obstacle else braking_displacement(vel, ahead_s, brake_m_s2)
-        found.append(replace(keep_out, pos_ned_m=np.vstack([pos, pos[-1] + way])))
-    return KeepOuts(found)
 
 
 def slowed(desired: DesiredReference, from_ned_m: Array, pace_01: float) -> DesiredReference:

@@ -11,17 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarmctl.control.collision.separation import (
-    NO_KEEP_OUTS,
-    KeepOut,
-    KeepOuts,
-    SeparationParams,
-    certify,
-    keep_out_of_commitment,
-)
+from swarmctl.control.collision.keep_outs import NO_KEEP_OUTS, KeepOut, KeepOuts, lasting
+from swarmctl.control.collision.separation import SeparationParams, certify, keep_out_of_commitment
 from swarmctl.control.commit.commit_params import CommitParams, interpolation_margin_m, planning
 from swarmctl.control.commit.halting import halted, places_apart_m
-from swarmctl.control.commit.situation import Situation, lasting, with_run_up
+from swarmctl.control.commit.situation import Situation, with_run_up
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem, Start

@@ -14,7 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
+from swarmctl.control.collision.keep_outs import KeepOut, moved_on
+from swarmctl.control.collision.separation import certify
 from swarmctl.control.collision.volume_certificate import volume_margin_m
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.controllers.own import OwnController
@@ -182,7 +183,7 @@ class Guard:
         stop_s = float(np.linalg.norm(plan.vel_ned_m_s[-1])) / separation.brake_m_s2
         tail_s = np.linspace(0.0, max(dt_s, stop_s), _TAIL_POINTS)
         path = plan.pos_ned_m[-1] + braking_displacement(plan.vel_ned_m_s[-1], tail_s, separation.brake_m_s2)
-        behind = [_braking(keep_out, tail_s, dt_s, separation) for keep_out in keep_outs]
+        behind = [replace(k, pos_ned_m=moved_on(k, tail_s, dt_s, separation.brake_m_s2)) for k in keep_outs]
         return float(np.minimum(certify(plan.pos_ned_m, keep_outs, 1), certify(path, behind, 1)))
 
 
@@ -214,13 +215,6 @@ class _Chatter:
             self._ahead = min(most + 0.5 * _SLEW_1_S, max(0.0, self._ahead + change - follows))
         self._last = tilt, t_us
         return "tilts to and fro faster than the vehicle follows" if self._ahead > most else ""
-
-
-def _braking(keep_out: KeepOut, tail_s: Array, dt_s: float, separation: SeparationParams) -> KeepOut:
-    """Return a keep-out behind the end of its positions, which are `dt_s` apart: it brakes."""
-    pos = keep_out.pos_ned_m
-    vel = (pos[-1] - pos[-2]) / dt_s
-    return replace(keep_out, pos_ned_m=pos[-1] + braking_displacement(vel, tail_s, separation.brake_m_s2))
 
 
 def _copied(problem: Problem) -> Problem:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from swarmctl.control.collision.separation import KeepOut, align, certify
+from swarmctl.control.collision.keep_outs import KeepOut
+from swarmctl.control.collision.separation import align, certify
 from swarmctl.control.collision.volume_certificate import volume_margin_m
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.flight_volume import FlightVolume

@@ -18,7 +18,8 @@ import numpy as np
 from pydantic import ConfigDict, Field
 
 from swarmctl.control.collision.half_spaces import half_spaces
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, stacked
+from swarmctl.control.collision.keep_outs import KeepOut, KeepOuts, stacked
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Faces, HalfSpaces, Horizon, Penalties, Terminal
 from swarmctl.control.mpc.condensed import CondensedMpc

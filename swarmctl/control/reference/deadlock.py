@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.reference.deadlock_params import DeadlockParams
 from swarmctl.control.reference.shortest_path import Polyline, shortest_path
 from swarmctl.core.flight_volume import FlightVolume

@@ -16,7 +16,7 @@ from swarmctl.agent.flying.mode_selector import ModeSelector
 from swarmctl.agent.tick_results import PlanningResult
 from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.config import load
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.core.types import Array, FlightMode, Mode, Phase, Plan, PlanStatus, VehicleState
 from tests import builders
 

@@ -9,7 +9,8 @@ import pytest
 
 from swarmctl.agent.components import SEPARATION_MODES
 from swarmctl.agent.planning.separation_policy import BestEffort, Guaranteed, SeparationInputs, SeparationPolicy
-from swarmctl.control.collision.separation import KeepOuts, SeparationParams
+from swarmctl.control.collision.keep_outs import KeepOuts
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.core.types import Phase
 from tests import builders

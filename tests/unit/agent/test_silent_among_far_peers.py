@@ -12,7 +12,8 @@ from swarmctl.bus import topics
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.messages.commitment_messages import decode_trajectory_message, encode_trajectory_message
 from swarmctl.bus.messages.path_messages import encode_path
-from swarmctl.control.collision.separation import KeepOuts, SeparationParams, keep_out_of_commitment
+from swarmctl.control.collision.keep_outs import KeepOuts
+from swarmctl.control.collision.separation import SeparationParams, keep_out_of_commitment
 from swarmctl.core.trajectory import Trajectory, resting
 from swarmctl.core.trajectory_message import ANYWHERE, Proposal, Reach
 from tests import builders

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
+from swarmctl.control.collision.keep_outs import KeepOut, KeepOuts
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit import trajectory_planner
 from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.commit.situation import DesiredReference

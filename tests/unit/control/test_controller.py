@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.controllers.discovery import CONTROLLERS, ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.controllers.pid import PidParams

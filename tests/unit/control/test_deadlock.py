@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.reference.deadlock import DeadlockRecovery, ProgressMonitor
 from swarmctl.control.reference.deadlock_params import DeadlockParams
 from swarmctl.core.obstacle import Obstacle

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.encounters import Encounters
-from swarmctl.control.collision.separation import KeepOut, KeepOuts, certify
+from swarmctl.control.collision.keep_outs import KeepOut, KeepOuts
+from swarmctl.control.collision.separation import certify
 from tests import builders
 from tests.benches.keep_outs import fixed, line
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOuts, SeparationParams, keep_out_of_obstacle, keep_out_of_peer
+from swarmctl.control.collision.keep_outs import KeepOuts
+from swarmctl.control.collision.separation import SeparationParams, keep_out_of_obstacle, keep_out_of_peer
 from swarmctl.control.commit.commit_params import CommitParams, interpolation_margin_m
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner

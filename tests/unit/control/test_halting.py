@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOuts
+from swarmctl.control.collision.keep_outs import KeepOuts
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.halting import halted, places_apart_m
 from swarmctl.control.commit.protocol import Commitments

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
+from swarmctl.control.collision.keep_outs import KeepOut
+from swarmctl.control.collision.separation import SeparationParams, certify
 from swarmctl.control.model import acceleration
 from swarmctl.control.mpc.axes import Terminal
 from swarmctl.control.mpc.joint_mpc import JointMpc

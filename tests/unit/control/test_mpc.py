@@ -8,7 +8,8 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
+from swarmctl.control.collision.keep_outs import KeepOut
+from swarmctl.control.collision.separation import SeparationParams, certify
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.axes import AxesSolution

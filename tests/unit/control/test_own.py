@@ -146,6 +146,16 @@ def test_a_vehicle_must_be_able_to_stop_behind_its_plan() -> None:
     assert controller.plan(hover(controller, (4.0, 0.0, 0.0))).failure == ""
 
 
+@pytest.mark.parametrize(("priority_id", "refused"), [(-1, True), (1, False)])
+def test_behind_its_plan_an_obstacle_moves_on_and_a_peer_brakes(priority_id: int, refused: bool) -> None:
+    """Comes from 4.4 m north at 2 m/s: while the vehicle stops, in 0.53 s, 1.06 m, or 0.64 m of a peer that brakes."""
+    controller = guarded(north)
+    way = -2.0 * np.arange(controller.steps + 1) * controller.dt_us * 1e-6
+    pos = HERE + np.column_stack([4.4 + way, 0 * way, 0 * way])
+    problem = replace(hover(controller), keep_outs=(builders.keep_out(pos_ned_m=pos, priority_id=priority_id),))
+    assert ("plans too close" in controller.plan(problem).failure) == refused
+
+
 def falling(own: OwnController, problem: Problem) -> Array:
     return np.tile([0.0, 0.0, 0.0], (own.steps, 1))
 

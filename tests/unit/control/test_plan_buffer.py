@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.flight_volume import FlightVolume, VolumeParams

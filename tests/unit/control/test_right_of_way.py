@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.half_spaces import half_spaces
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.core.types import Array
 from tests import builders
 from tests.benches.keep_outs import PARAMS, STEPS, line
