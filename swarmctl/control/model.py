@@ -37,7 +37,7 @@ class VehicleModelParams(Params):
     heading: Literal["euler", "swing_twist"] = "euler"  # how a tilted body is turned; swing_twist: as little as can be
     speed_max_m_s: float = Field(
         20.0, gt=0, le=100
-    )  # references far away are approached no faster, far below also as they can brake; faster missions are refused
+    )  # references far away are approached no faster, and as the vehicle can brake; faster missions are refused
 
     def lag(self) -> Lag | None:
         """Return the lag of the attitude behind its setpoints; None if it follows at once."""

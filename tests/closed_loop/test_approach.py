@@ -1,14 +1,16 @@
-"""Who is away from its reference approaches it at `vehicle_model.speed_max_m_s` at most, and sinks as it can brake.
+"""Who is away from its reference approaches it at `vehicle_model.speed_max_m_s` at most, and as fast as it can brake.
 
 From rest a plan makes up for the time lost: it exceeds that by up to a tenth for a moment, and settles at it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
-from swarmctl.agent.planning import reference_selector
+from swarmctl.control.reference import approach
 from swarmctl.core.types import Phase
 from tests.closed_loop.conftest import Flight, Fly
 from tests.closed_loop.test_operator import phase
@@ -17,11 +19,11 @@ SPEED_M_S = 3.0
 BEGIN_NED_M, END_NED_M = [25.0, 0.0, -5.0], [25.0, 0.5, -5.0]  # of the reference, 25 m from the start
 
 
-def fly_there(fly: Fly, speed_max_m_s: float, mode: str) -> Flight:
+def fly_there(fly: Fly, speed_max_m_s: float, mode: str, from_ned_m: Sequence[float] = (0.0, 0.0, -3.0)) -> Flight:
     return fly(
         "swarm.agents=1",
         "sitl.start=air",
-        "start.positions_ned_m=[[0,0,-3]]",
+        f"start.positions_ned_m=[{list(from_ned_m)}]",
         "mission.kind=waypoints",
         "mission.duration_s=15",
         f"mission.waypoints.lists=[{{points_ned_m=[{BEGIN_NED_M},{END_NED_M}]}}]",
@@ -69,5 +71,23 @@ def test_who_is_sent_far_down_brakes_with_what_thrust_is_left_beside_the_weight(
 def test_negative_control_without_a_limit_of_sinking_it_falls_into_the_ground(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reference_selector, "sink_max_m_s", lambda _: 100.0)
+    monkeypatch.setattr(approach, "_FAR_S", 100.0)
+    monkeypatch.setattr(approach, "_NEARLY", 100.0)
     assert lowest_m(fly) < 0.0
+
+
+def past_it_m(fly: Fly, mode: str) -> float:
+    """Fly to a reference that stands 30 m away; return how far the vehicle gets beyond it."""
+    flight = fly_there(fly, 100.0, mode, from_ned_m=(-5.0, 0.0, -5.0))
+    return float(flight.pos_ned_m[:, 0, 0].max()) - BEGIN_NED_M[0]
+
+
+@pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
+def test_who_comes_fast_does_not_fly_past_its_reference(fly: Fly, mode: str) -> None:
+    assert past_it_m(fly, mode) < 0.1
+
+
+@pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
+def test_negative_control_plans_alone_brake_too_late(fly: Fly, mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(approach, "_NEARLY", 100.0)
+    assert past_it_m(fly, mode) > 3.0

@@ -56,7 +56,8 @@ def test_references_commitments_and_records_of_a_held_up_tick_are_of_its_beginni
         rows = running.logs[0].rows
         if agent is not None and rows and np.isfinite(rows[-1]["mission_t_s"][0]):
             committed = agent._planner.directive.reference
-            reference, _ = agent._planner._references.reference(running.world.truth_rows()["pos_ned_m"][0])
+            truth = running.world.truth_rows()
+            reference, _ = agent._planner._references.reference(truth["pos_ned_m"][0], truth["vel_ned_m_s"][0])
             followed_ned_m.append((reference if committed is None else committed).pos_ned_m[0].copy())
         return running.clock.now_us() >= 8_000_000
 

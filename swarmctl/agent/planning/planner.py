@@ -92,7 +92,7 @@ class Planner:
             self._alerts.put("volume", outside, now_us)
         self._references.look_ahead(now_us, self._utc_of_us(now_us))
         self._detect_deadlock(now_us, state, keep_outs, controls)
-        reference, now_ref = self._references.reference(state.pos_ned_m)
+        reference, now_ref = self._references.reference(state.pos_ned_m, state.vel_ned_m_s)
         self.directive = self._separate(now_us, state, keep_outs, controls)
         plan = self._solve(now_us, start, reference) if flies else None
         if self._rehearsal is not None and Phase.STANDBY <= mission.phase < Phase.GOTO_START:

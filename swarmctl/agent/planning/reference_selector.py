@@ -11,7 +11,7 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.control.phases.mission_state import MissionState
-from swarmctl.control.reference.approach import approached, sink_max_m_s
+from swarmctl.control.reference.approach import Approach
 from swarmctl.control.reference.deadlock import Deadlock, DeadlockRecovery
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, Phase, Reference, Sampled
@@ -33,9 +33,7 @@ class ReferenceSelector:
             setup.params.deadlock, setup.agent, setup.separation.budget.radius_m, setup.volume
         )
         self._ahead_s, self._now_and_ahead_s = ahead_s, np.concatenate([[0.0], ahead_s])
-        model = setup.vehicle_model
-        self._speed_max_m_s = model.speed_max_m_s
-        self._sink_max_m_s = sink_max_m_s(setup.controller.mpc.most_thrust_m_s2(model))
+        self._approach = Approach(setup.controller.mpc, setup.vehicle_model, plans=setup.controller.plans)
         self._mission_ned = np.zeros((len(ahead_s) + 1, 3)), np.zeros((len(ahead_s) + 1, 3))  # positions, velocities
         self._left_ned: tuple[Array, Array] | None = None  # the mission's own, (1, 3) each, while that is not followed
         self._reported: Deadlock | None = None
@@ -93,11 +91,11 @@ class ReferenceSelector:
         self._recovery.reset()
         self._report(now_us)
 
-    def reference(self, pos_ned_m: Array) -> tuple[Reference, Reference]:
+    def reference(self, pos_ned_m: Array, vel_ned_m_s: Array) -> tuple[Reference, Reference]:
         """Return the reference at the times asked for, (N, 3) each, and the mission's own one now, (1, 3).
 
-        The first, where it is far away, is approached from the own position (3,) no faster than the vehicle may fly and
-        sink.
+        The first, where it is far away, is approached from the own position (3,), with the own velocity (3,), no faster
+        than the vehicle may fly and can stop from.
         The mission's own one is that which agents share, without the own place around it; before and after the mission
         it is the one that is followed.
         """
@@ -106,14 +104,7 @@ class ReferenceSelector:
         now_ref = Reference(own_ned - self._mission.place_offset_ned_m, own_m_s, self._yaw_rad)
         if self._recovery.active:
             return Reference(*self._recovery.sample(self._ahead_s), self._yaw_rad), now_ref
-        near = approached(
-            pos[1:],
-            vel[1:],
-            self._ahead_s,
-            pos_ned_m,
-            speed_max_m_s=self._speed_max_m_s,
-            sink_max_m_s=self._sink_max_m_s,
-        )
+        near = self._approach.reference(pos[1:], vel[1:], self._ahead_s, own_ned_m=pos_ned_m, own_ned_m_s=vel_ned_m_s)
         return Reference(*near, self._yaw_rad), now_ref
 
     def desired(self, now_us: int, utc_us: int) -> DesiredReference:

@@ -20,7 +20,7 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
-from swarmctl.control.reference.approach import approached, sink_max_m_s
+from swarmctl.control.reference.approach import Approach
 from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_NED_M_S2
@@ -72,13 +72,13 @@ class TrajectoryPlanner:
     ) -> None:
         self._volume, self._budget = volume, separation.budget
         self._params, self._separation = params, separation
-        self._drag_1_s, self._speed_max_m_s = vehicle.drag_1_s, vehicle.speed_max_m_s
+        self._drag_1_s = vehicle.drag_1_s
         right_of_way = separation.model_copy(
             update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
         )
         bounded = planning(mpc, params, vehicle)
         self._hardest_m_s2 = bounded.accel_max_m_s2(vehicle)
-        self._sink_max_m_s = sink_max_m_s(bounded.most_thrust_m_s2(vehicle))
+        self._approach = Approach(bounded, vehicle, plans=True)
         self._interpolation_margin_m = interpolation_margin_m(mpc, params, vehicle)
         self._mpc = SwarmMpc(
             bounded,
@@ -236,7 +236,7 @@ class TrajectoryPlanner:
             cos_tilt=max(_LEAST_COS_TILT, math.sqrt(1.0 - float(virtual_control[:2] @ virtual_control[:2]))),
             virtual_control=virtual_control,
         )
-        wanted = self._wanted(now, ahead_us, pos[0])
+        wanted = self._wanted(now, ahead_us, pos[0], vel[0])
         guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if now.desired.follows_path else pos
         agents = [message.agent for message in now.peers.values() for _ in message.followed]
         keep_outs = self._keep_outs(now.followed, agents, now.begin_us, steps)
@@ -253,16 +253,12 @@ class TrajectoryPlanner:
         )
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
 
-    def _wanted(self, now: Situation, ahead_us: Array, begin_ned_m: Array) -> Reference:
+    def _wanted(self, now: Situation, ahead_us: Array, begin_ned_m: Array, begin_ned_m_s: Array) -> Reference:
         """Return the desired reference at times after the plan's begin, approached from there as fast as allowed."""
         motion = now.desired.reference(1e-6 * (ahead_us + (now.begin_us - now.utc_us)))
         if not now.desired.follows_path:
-            motion = approached(
-                *motion,
-                1e-6 * ahead_us,
-                begin_ned_m,
-                speed_max_m_s=self._speed_max_m_s,
-                sink_max_m_s=self._sink_max_m_s,
+            motion = self._approach.reference(
+                *motion, 1e-6 * ahead_us, own_ned_m=begin_ned_m, own_ned_m_s=begin_ned_m_s
             )
         return Reference(*motion, 0.0)
 

@@ -1,54 +1,91 @@
-"""The way to a reference from far away: no faster than the vehicle may fly, or could stop before the ground.
+"""The way to a reference from far away: no faster than the vehicle may fly, and can stop from.
 
-A controller that minimises distances flies to a reference 30 m away as fast as it can, however slow the reference is,
-and falls to one that is 20 m below: by no more than gravity, while braking has only what thrust is left beside it.
+A controller that minimises distances flies to a reference 60 m away as fast as it can, however slow the reference is,
+and brakes when its horizon reaches there: 16 m too late at 12 m/s. To one that is 20 m below it falls, braked by no
+more than what thrust is left beside its weight.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array
 
 _FAR_S = 0.8  # at the largest speed: what is nearer is braked for
 _LEAST_SINK_M_S = 0.3  # however little thrust is left
+_OF_BRAKING = 0.85  # share of the largest deceleration with which speeds fall on the way
+_SEEN_EARLY = 3.0  # speed that controllers brake from by themselves, in decelerations by `_FAR_S`; at 4 they are late
+_NEARLY = 0.9  # share of the speed on the way from which on it is told
 
 
-def sink_max_m_s(thrust_max_m_s2: float) -> float:
-    """Return the largest speed downwards with so much thrust over mass: it stops in half of what `_FAR_S` leads to."""
-    return max(_LEAST_SINK_M_S, _FAR_S * (thrust_max_m_s2 - GRAVITY_M_S2))
-
-
-def approached(
-    pos_ned_m: Array,
-    vel_ned_m_s: Array,
-    ahead_s: Array,
-    from_ned_m: Array,
-    *,
-    speed_max_m_s: float,
-    sink_max_m_s: float,
-) -> tuple[Array, Array]:
-    """Return a reference, positions and velocities (N, 3) each; of one that is far away, what can be reached by then.
-
-    The rest is replaced by the straight way there at the largest speed: a vehicle that already flies as fast is then on
-    its reference.
+class Approach:
+    """Limits how a reference is approached.
 
     Args:
-        pos_ned_m, vel_ned_m_s: reference (N, 3).
-        ahead_s: (N,) times of it from now, >= 0.
-        from_ned_m: where the vehicle is now (3,).
-        speed_max_m_s: largest speed.
-        sink_max_m_s: largest speed downwards.
+        mpc: parameters of the controller that follows it.
+        vehicle: bounds of the airframe.
+        plans: whether that controller plans by them. Others brake by the distance that is left, which has to be told.
     """
-    way_ned_m = pos_ned_m - from_ned_m
-    far_m, down_m = np.sqrt((way_ned_m * way_ned_m).sum(axis=1)), way_ned_m[:, 2]
-    ahead_or_near_s = np.maximum(ahead_s, _FAR_S)
-    if (far_m <= speed_max_m_s * ahead_or_near_s).all() and (down_m <= sink_max_m_s * ahead_or_near_s).all():
-        return pos_ned_m, vel_ned_m_s
-    least_s = np.maximum(far_m / speed_max_m_s, down_m / sink_max_m_s)  # that the way takes
-    beyond = least_s > ahead_s
-    pos, vel = pos_ned_m.copy(), vel_ned_m_s.copy()
-    vel[beyond] = way_ned_m[beyond] / least_s[beyond, None]
-    pos[beyond] = from_ned_m + vel[beyond] * ahead_s[beyond, None]
-    return pos, vel
+
+    def __init__(self, mpc: MpcParams, vehicle: VehicleModelParams, *, plans: bool) -> None:
+        accel_max_m_s2 = mpc.accel_max_m_s2(vehicle)
+        self._speed_max_m_s, self._brake_m_s2 = vehicle.speed_max_m_s, _OF_BRAKING * accel_max_m_s2
+        self._sink_max_m_s = max(_LEAST_SINK_M_S, _FAR_S * (mpc.most_thrust_m_s2(vehicle) - GRAVITY_M_S2))
+        near_s = _SEEN_EARLY * min(_FAR_S, mpc.horizon_xy * mpc.dt_s)
+        self._near_m_s = accel_max_m_s2 * near_s
+        self._near_m = 0.5 * self._near_m_s * near_s / _OF_BRAKING if plans else math.inf
+
+    def reference(
+        self, pos_ned_m: Array, vel_ned_m_s: Array, ahead_s: Array, *, own_ned_m: Array, own_ned_m_s: Array
+    ) -> tuple[Array, Array]:
+        """Return a reference, positions and velocities (N, 3) each; of a far one what can be reached by then.
+
+        The rest is replaced by the straight way there at the largest speed: a vehicle that already flies as fast is
+        then on its reference. Downwards that is what thrust stops in half of the way of `_FAR_S`. A vehicle that comes
+        closer so fast that it could hardly stop is told to brake.
+
+        Args:
+            pos_ned_m, vel_ned_m_s: reference (N, 3).
+            ahead_s: (N,) times of it from now, >= 0.
+            own_ned_m, own_ned_m_s: where the vehicle is now, and its velocity (3,).
+        """
+        way_ned_m = pos_ned_m - own_ned_m
+        far_m, down_m = np.sqrt((way_ned_m * way_ned_m).sum(axis=1)), way_ned_m[:, 2]
+        if far_m[0] > self._near_m:
+            direction = way_ned_m[0] / far_m[0]
+            allowed_m_s = self._allowed_m_s(float(far_m[0]), float(direction[2]))
+            if float((own_ned_m_s - vel_ned_m_s[0]) @ direction) > _NEARLY * allowed_m_s:
+                return self._braking(pos_ned_m, vel_ned_m_s, ahead_s, way_ned_m[0], allowed_m_s)
+        ahead_or_near_s = np.maximum(ahead_s, _FAR_S)
+        if (far_m <= self._speed_max_m_s * ahead_or_near_s).all() and (
+            down_m <= self._sink_max_m_s * ahead_or_near_s
+        ).all():
+            return pos_ned_m, vel_ned_m_s
+        least_s = np.maximum(far_m / self._speed_max_m_s, down_m / self._sink_max_m_s)  # that the way takes
+        beyond = least_s > ahead_s
+        pos, vel = pos_ned_m.copy(), vel_ned_m_s.copy()
+        vel[beyond] = way_ned_m[beyond] / least_s[beyond, None]
+        pos[beyond] = own_ned_m + vel[beyond] * ahead_s[beyond, None]
+        return pos, vel
+
+    def _allowed_m_s(self, far_m: float, down: float) -> float:
+        """Return the largest speed towards a reference so far away, whose direction has so much of down."""
+        stops_m_s = math.sqrt(self._near_m_s**2 + 2.0 * self._brake_m_s2 * (far_m - self._near_m))
+        sinks_m_s = self._sink_max_m_s / down if down > 0.0 else math.inf
+        return min(stops_m_s, self._speed_max_m_s, sinks_m_s)
+
+    def _braking(
+        self, pos_ned_m: Array, vel_ned_m_s: Array, ahead_s: Array, way_ned_m: Array, speed_m_s: float
+    ) -> tuple[Array, Array]:
+        """Return the way along which a vehicle, `way_ned_m` (3,) away from the reference, stops beside it."""
+        far_m = float(np.sqrt(way_ned_m @ way_ned_m))
+        braked_s = np.minimum(ahead_s, speed_m_s / self._brake_m_s2)
+        left_m = far_m - (speed_m_s - 0.5 * self._brake_m_s2 * braked_s) * braked_s
+        slower_m_s = speed_m_s - self._brake_m_s2 * braked_s
+        direction = way_ned_m / far_m
+        return pos_ned_m - left_m[:, None] * direction, vel_ned_m_s + slower_m_s[:, None] * direction
