@@ -58,9 +58,10 @@ class Approach:
         far_m, down_m = np.sqrt((way_ned_m * way_ned_m).sum(axis=1)), way_ned_m[:, 2]
         if far_m[0] > self._near_m:
             direction = way_ned_m[0] / far_m[0]
-            allowed_m_s = self._allowed_m_s(float(far_m[0]), float(direction[2]))
-            if float((own_ned_m_s - vel_ned_m_s[0]) @ direction) > _NEARLY * allowed_m_s:
-                return self._braking(pos_ned_m, vel_ned_m_s, ahead_s, way_ned_m[0], allowed_m_s)
+            stops_m_s = math.sqrt(self._near_m_s**2 + 2.0 * self._brake_m_s2 * float(far_m[0] - self._near_m))
+            if float((own_ned_m_s - vel_ned_m_s[0]) @ direction) > _NEARLY * stops_m_s:
+                speed_m_s = min(stops_m_s, self._faster_m_s(vel_ned_m_s[0], direction))
+                return self._braking(pos_ned_m, vel_ned_m_s, ahead_s, way_ned_m[0], speed_m_s)
         ahead_or_near_s = np.maximum(ahead_s, _FAR_S)
         if (far_m <= self._speed_max_m_s * ahead_or_near_s).all() and (
             down_m <= self._sink_max_m_s * ahead_or_near_s
@@ -73,11 +74,11 @@ class Approach:
         pos[beyond] = own_ned_m + vel[beyond] * ahead_s[beyond, None]
         return pos, vel
 
-    def _allowed_m_s(self, far_m: float, down: float) -> float:
-        """Return the largest speed towards a reference so far away, whose direction has so much of down."""
-        stops_m_s = math.sqrt(self._near_m_s**2 + 2.0 * self._brake_m_s2 * (far_m - self._near_m))
-        sinks_m_s = self._sink_max_m_s / down if down > 0.0 else math.inf
-        return min(stops_m_s, self._speed_max_m_s, sinks_m_s)
+    def _faster_m_s(self, vel_ned_m_s: Array, direction: Array) -> float:
+        """Return by how much a vehicle may be faster, in a direction (3,), than a reference with a velocity (3,)."""
+        down = float(direction[2])
+        sinks_m_s = (self._sink_max_m_s - float(vel_ned_m_s[2])) / down if down > 0.0 else math.inf
+        return max(0.0, min(self._speed_max_m_s - float(vel_ned_m_s @ direction), sinks_m_s))
 
     def _braking(
         self, pos_ned_m: Array, vel_ned_m_s: Array, ahead_s: Array, way_ned_m: Array, speed_m_s: float

@@ -102,6 +102,17 @@ def test_who_follows_at_the_speed_of_its_reference_is_not() -> None:
     assert np.array_equal(braked(*moving)[0], moving[0])
 
 
+@pytest.mark.parametrize(("along", "speed_max_m_s", "thrust_max_01"), [(NORTH, 9.5, 1.0), (DOWN, 50.0, 0.8)])
+def test_who_brakes_is_told_no_more_than_a_vehicle_may_fly_and_sink(
+    along: Array, speed_max_m_s: float, thrust_max_01: float
+) -> None:
+    pos, vel = away(20.0, 20.0, 20.0, along=along), np.tile(4.0 * along, (3, 1))
+    told_m_s = found(pos, vel, own_ned_m_s=15.0 * along, speed_max_m_s=speed_max_m_s, thrust_max_01=thrust_max_01)[1]
+    assert np.linalg.norm(told_m_s, axis=1).max() <= speed_max_m_s
+    assert told_m_s[:, 2].max() <= (2.0 * thrust_max_01 - 1.0) * 0.8 * GRAVITY_M_S2
+    assert (told_m_s @ along).min() > 3.999, "and no slower than its reference"
+
+
 def test_what_brakes_by_the_distance_that_is_left_is_told_that() -> None:
     """A PID that followed speeds instead flew 30 m past its goal."""
     assert np.array_equal(braked(*STANDS, plans=False)[0], STANDS[0])
