@@ -86,8 +86,8 @@ class Dialect:
     def to_read(self) -> tuple[str, ...]:
         """Return the names of the parameters that an agent reads before flight."""
         takeoff = [self.takeoff_parameter] if self.takeoff_parameter else []
-        rules = [rule.name for rule in self.rules]
-        return tuple(dict.fromkeys([*rules, self.hover_parameter, *self.thrust_parameters, *takeoff]))
+        rules, timeouts = [rule.name for rule in self.rules], (self.loss_parameter, self.landing_parameter)
+        return tuple(dict.fromkeys([*rules, self.hover_parameter, *self.thrust_parameters, *takeoff, *timeouts]))
 
     def steps(self, command: Command) -> tuple[Command, ...]:
         """Return the commands that make up one request."""

@@ -639,7 +639,7 @@ def test_a_new_dialect_needs_nothing_but_itself(config: Config, monkeypatch: pyt
     third = changed(COPTER, autopilot="Third", autopilot_number=99, parameters=parameters(values))
     assert "swarmctl flies" in line_of(findings([third], with_params(config)), "autopilot").advice, "not yet"
     monkeypatch.setitem(DIALECTS, 99, dialect)
-    assert names_to_read(dialect, with_params(config)) == ("RULED", "HOVER", "CHECKED")
+    assert names_to_read(dialect, with_params(config)) == ("RULED", "HOVER", "LOSS", "LANDING", "CHECKED")
     found = findings([third], with_params(config))
     assert "1.0" in line_of(found, "autopilot").advice
     assert line_of(found, "RULED").verdict is FIX

@@ -26,7 +26,7 @@ PX4, ARDUCOPTER = 12, 3
 LEVEL = [1.0, 0.0, 0.0, 0.0]
 
 
-PX4_WITHOUT_AGENT = {"COM_OBL_RC_ACT": 4, "NAV_DLL_ACT": 3, "COM_DL_LOSS_T": 5}
+PX4_WITHOUT_AGENT = {"COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 1.0, "NAV_DLL_ACT": 3, "COM_DL_LOSS_T": 5}
 PX4_THRUST = {"MPC_THR_HOVER": 0.45, "THR_MDL_FAC": 0.0, "MPC_THR_MIN": 0.1, "MPC_THR_MAX": 1}
 TAKEOFF_M = 2.5  # of a PX4 that has not flown for an agent
 COPTER_WITHOUT_AGENT = {"FS_GCS_ENABLE": 5, "FS_GCS_TIMEOUT": 2.0, "ATC_ANGLE_BOOST": 0, "SYSID_MYGCS": 255}
@@ -152,6 +152,14 @@ def test_px4_is_set_up_in_two_seconds_and_left_alone_then() -> None:
     vehicle.asked.clear()
     vehicle.run(10.0)
     assert vehicle.asked == []
+
+
+@pytest.mark.parametrize(("autopilot", "loss_s", "landing_s"), [(PX4, 1.0, 1.0), (ARDUCOPTER, 3.0, 2.0)])
+def test_when_the_vehicle_flies_by_itself_is_read_also_where_nothing_sets_it(
+    autopilot: int, loss_s: float, landing_s: float
+) -> None:
+    pilot = Vehicle(autopilot).set_up().run(4.0).pilot
+    assert (pilot.setpoint_loss_s, pilot.landing_delay_s) == (loss_s, landing_s)
 
 
 def test_setpoints_are_to_be_repeated_as_fast_as_they_come_from_the_first_one_on() -> None:
