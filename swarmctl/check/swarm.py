@@ -14,7 +14,7 @@ from swarmctl.check.scan.link_facts import Ned, VehicleFacts
 from swarmctl.check.services import service_findings
 from swarmctl.check.vehicle.findings import vehicle_findings
 from swarmctl.config import Config
-from swarmctl.control.phases.departure import LEAST_CLIMB_M
+from swarmctl.control.phases.departure import LEAST_CLIMB_M, is_beyond_reach
 from swarmctl.core.types import Landed
 from swarmctl.core.verdict import Verdict
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START
@@ -88,9 +88,9 @@ def _start(facts: VehicleFacts, config: Config) -> list[Finding]:
         )
         return line(FIX, advice, 77)
     state_machine = config.agent.state_machine
-    if away_m / state_machine.speed_m_s > state_machine.start_timeout_s:
+    if is_beyond_reach(pos, start, state_machine):
         within = f"agent.state_machine.start_timeout_s = {state_machine.start_timeout_s:g}"
-        advice = f"it can't get there within {within}: move it"
+        advice = f"it can't get there within {within}: correct swarm.origin_*, or move it; it is not armed"
         return line(FIX, advice, 76)
     if away_m > _FAR_M:
         return line(NOTE, "far from its start; is the way there free?", 6)

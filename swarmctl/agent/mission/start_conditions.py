@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 from swarmctl.agent.setup import AgentSetup
@@ -10,6 +11,7 @@ from swarmctl.bus.bus import agent_name
 from swarmctl.control.collision.separation import radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
 from swarmctl.control.failsafe.overload import Readiness
+from swarmctl.control.phases.departure import is_beyond_reach
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.control.reference.landing_places import nearest_in_plane_m
 from swarmctl.core.types import Array, Landed, Phase, VehicleState
@@ -44,9 +46,9 @@ class StartConditions:
     ) -> str:
         """Return why arming, or the climb that follows it, must wait, or "".
 
-        A peer flies other code, the estimator still settles, or is too inaccurate for the separation, or another
-        vehicle stands too close: the autopilot, which climbs first, knows no peers. Between arming and the climb
-        another one may come, where an order or a lost link delays the climb.
+        The start is out of reach, a peer flies other code, the estimator still settles, or is too inaccurate for the
+        separation, or another vehicle stands too close: the autopilot, which climbs first, knows no peers. Between
+        arming and the climb another one may come, where an order or a lost link delays the climb.
 
         Args:
             now_us: monotonic time.
@@ -55,6 +57,8 @@ class StartConditions:
             others_ned_m: returns the position (3,) of each peer.
             codes: returns the code that each peer flies, by agent number.
         """
+        if far := self._far_start(state):
+            return far
         if len(self._setup.starts_ned_m) == 1:
             return ""
         if self._mission.phase in (Phase.ARM, Phase.TAKEOFF):
@@ -70,6 +74,19 @@ class StartConditions:
             or radius_problem(separation, accuracy_m, self._setup.drift_m)
         )
         return problem or self._who_is_beside(state, others_ned_m, now_us, away_for_us=_APART_FOR_US)
+
+    def _far_start(self, state: VehicleState | None) -> str:
+        """Return that the start is too far from where the vehicle stands, or ""."""
+        if self._mission.phase > Phase.STANDBY or state is None or state.landed is not Landed.ON_GROUND:
+            return ""
+        place, start = state.pos_ned_m.tolist(), self._setup.starts_ned_m[self._setup.agent].tolist()
+        if not is_beyond_reach(place, start, self._setup.params.state_machine):
+            return ""
+        away_m, climb_m = math.dist(place[:2], start[:2]), place[2] - start[2]
+        return (
+            f"its start to be within reach (it stands {away_m:.0f} m beside it, {climb_m:.0f} m below): correct "
+            "swarm.origin_*, or move it"
+        )
 
     def _other_code(self, codes: Callable[[], Mapping[int, str]]) -> str:
         """Return which peer flies other code than this agent, whose predictions of it would be wrong, or ""."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Set
+import math
+from collections.abc import Iterable, Sequence, Set
 
 import numpy as np
 
 from swarmctl.control.phases.inputs import PhaseInputs
+from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, VehicleState
 
@@ -43,6 +45,15 @@ def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[i
     if state.landed is Landed.ON_GROUND and (obstacle := _obstacle_over(inputs, state, top_ned_m)):
         return obstacle
     return "the autopilot's answers" if inputs.busy else ""
+
+
+def is_beyond_reach(pos_ned_m: Sequence[float], start_ned_m: Sequence[float], params: StateMachineParams) -> bool:
+    """Return whether a vehicle that stands at (3,) can't be at its start (3,) in time.
+
+    It is most often the shared origin that is somewhere else: the autopilot would climb to that height all the same.
+    """
+    away_m, climb_m = math.dist(pos_ned_m[:2], start_ned_m[:2]), max(0.0, pos_ned_m[2] - start_ned_m[2])
+    return away_m / params.speed_m_s + climb_m / _CLIMBS_M_S > params.start_timeout_s
 
 
 def unmet_climb_condition(inputs: PhaseInputs, state: VehicleState, top_ned_m: Array) -> str:

@@ -14,6 +14,7 @@ from swarmctl.agent.watches.alerts import Alerts
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.failsafe.overload import OverloadParams
 from swarmctl.control.phases.mission_state import MissionState
+from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.core.types import Landed, Phase
 from tests import builders
 
@@ -23,7 +24,8 @@ SETUP = SimpleNamespace(
     starts_ned_m=np.zeros((2, 3)),
     separation=SeparationParams(),
     drift_m=0.0,
-    params=SimpleNamespace(overload=OverloadParams()),
+    agent=0,
+    params=SimpleNamespace(overload=OverloadParams(), state_machine=StateMachineParams()),
 )
 
 
@@ -85,6 +87,34 @@ def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_w
         assert waits_for(at_s + 0.2, 0.9) == "", "and gone"
     mission.phase = Phase.GOTO_START
     assert waits_for(9.9, 0.4) == "", "an agent flies it, which avoids the other one"
+
+
+@pytest.mark.parametrize("vehicles", [1, 2])
+@pytest.mark.parametrize(
+    ("place_ned_m", "landed", "said"),
+    [
+        ((0.0, 0.0, 85.0), Landed.ON_GROUND, ""),
+        ((170.0, 0.0, 2.0), Landed.ON_GROUND, ""),
+        ((0.0, 0.0, 489.0), Landed.ON_GROUND, "(it stands 0 m beside it, 489 m below): correct swarm.origin_*"),
+        ((300.0, -400.0, 2.0), Landed.ON_GROUND, "(it stands 500 m beside it, 2 m below): correct swarm.origin_*"),
+        ((100.0, 0.0, 50.0), Landed.ON_GROUND, "(it stands 100 m beside it, 50 m below): correct swarm.origin_*"),
+        ((300.0, -400.0, 2.0), Landed.IN_AIR, ""),
+    ],
+)
+def test_nobody_is_armed_whose_start_is_somewhere_else(
+    place_ned_m: tuple[float, float, float], landed: Landed, said: str, vehicles: int
+) -> None:
+    """The autopilot would climb to the height of the start, wherever that is."""
+    setup, mission = SimpleNamespace(**vars(SETUP)), SimpleNamespace(phase=Phase.STANDBY)
+    setup.starts_ned_m = np.zeros((vehicles, 3))
+    conditions = StartConditions(cast(AgentSetup, setup), cast(MissionState, mission), Alerts())
+    stands = builders.vehicle_state(landed=landed, pos_ned_m=np.array(place_ned_m))
+    for second in range(6):
+        waits_for = conditions.unsettled(second * SECOND, 0.05, stands, tuple, dict)
+    assert said in waits_for
+    assert waits_for.startswith("its start to be within reach") == bool(said)
+    mission.phase = Phase.TAKEOFF
+    assert conditions.unsettled(6 * SECOND, 0.05, stands, tuple, dict) == ""
 
 
 def test_an_agent_whose_processor_has_too_much_to_do_waits_until_it_keeps_up_for_a_while() -> None:
