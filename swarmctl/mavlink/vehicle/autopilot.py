@@ -40,6 +40,7 @@ _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
 _ATTENDED_US = 300_000  # without news of the vehicle nobody flies it
 _HOVER_M_S = 0.2
+_MOST_LAT_E7 = 900_000_000
 _MOST_PARAMETERS = 5000  # an autopilot has some 1500
 _MOST_TEXTS = 20  # that wait to be read
 
@@ -295,11 +296,12 @@ class Autopilot:
     # -- frame, clock, accuracy, parameters ---------------------------------------------------------------------------
 
     def _origin(self, message: Any, arrived_us: int) -> None:
-        self.frame.told(_geodetic(message.latitude, message.longitude, message.altitude))
+        if _is_place(message.latitude, message.longitude):
+            self.frame.told(_geodetic(message.latitude, message.longitude, message.altitude))
 
     def _global_position(self, message: Any, arrived_us: int) -> None:
         sample = self.states.newest
-        if sample is not None:
+        if sample is not None and _is_place(message.lat, message.lon):
             place = _geodetic(message.lat, message.lon, message.alt)
             local_us, _, pos, vel = sample[:4]
             self.frame.seen(place, message.time_boot_ms * 1000, local_us, np.array(pos), vel_ned_m_s=np.array(vel))
@@ -359,6 +361,11 @@ class Autopilot:
             return self.mode is FlightMode.HOLD
         own = setpoint_us is None or now_us - setpoint_us > _OWN_FLIGHT_US
         return own and abs(sample.vel_ned_m_s[2]) < _HOVER_M_S
+
+
+def _is_place(lat_e7: int, lon_e7: int) -> bool:
+    """Return whether a place is on earth, and not the zeros that an ArduPilot sends while it knows none."""
+    return (lat_e7 != 0 or lon_e7 != 0) and abs(lat_e7) <= _MOST_LAT_E7 and abs(lon_e7) <= 2 * _MOST_LAT_E7
 
 
 def _geodetic(lat_e7: int, lon_e7: int, alt_mm: int) -> GeoOrigin:

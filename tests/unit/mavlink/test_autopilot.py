@@ -66,6 +66,23 @@ def test_origin_signs_north_is_x_east_is_y_higher_is_negative_z() -> None:
     np.testing.assert_allclose(pos_ned_m, [1.0 + 111.18, 2.0 + 75.5, 3.0 - 5.0], atol=0.2)
 
 
+@pytest.mark.parametrize(("lat_e7", "lon_e7"), [(0, 0), (900_000_001, 0), (473977420, 1_800_000_001)])
+def test_a_place_that_is_not_known_is_no_origin(lat_e7: int, lon_e7: int) -> None:
+    """Zeros would put the vehicle 5000 km away, and 2000 km below the height of its start."""
+    bench = Bench()
+    bench.heartbeat()
+    bench.say(dialect.MAVLink_gps_global_origin_message(lat_e7, lon_e7, 0))
+    for _ in range(40):
+        bench.clock.advance(100_000)
+        now_us = bench.clock.now_us()
+        bench.say(odometry(now_us))
+        bench.say(dialect.MAVLink_global_position_int_message(now_us // 1000, lat_e7, lon_e7, 0, 0, 0, 0, 0, 0))
+        bench.heartbeat()
+        assert bench.poll() is None
+    bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
+    assert bench.poll() is not None
+
+
 @pytest.mark.parametrize(
     ("base", "status", "armed", "failsafe"),
     [(128, 4, True, False), (81, 3, False, False), (209, 5, True, True), (128, 6, True, True), (0, 8, False, True)],
