@@ -188,6 +188,7 @@ class UdpTransport:
         self._greeting = greeting
         self.latch = Latch(is_vehicle, remote)
         self._admitted: Address | None = None  # sender that the kernel admits; None: every sender
+        self._empty_us = 0  # when nothing was left: what is read next has arrived since, also where UTC has been set
         self._stamped = sys.platform == "linux"
         if self._stamped:
             self._sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
@@ -210,16 +211,17 @@ class UdpTransport:
         latch.poll(now_us)
         self._admit(latch.only)
         arrived: list[Datagram] = []
-        left = _BYTES_A_POLL
+        left, least_us = _BYTES_A_POLL, self._empty_us
         for _ in range(_DATAGRAMS_A_POLL):
             try:
                 data, ancillary, _, sender = self._sock.recvmsg(MAX_DATAGRAM, 64)
             except ConnectionRefusedError:
                 continue  # ICMP port unreachable surfaces here once
             except OSError:
-                break  # the socket is empty
+                self._empty_us = now_us
+                break
             if latch.admits(sender, data):
-                arrived.append(Datagram(self._arrival_us(ancillary, now_us), data))
+                arrived.append(Datagram(max(least_us, self._arrival_us(ancillary, now_us)), data))
                 left -= len(data)
             elif latch.only is None and (greeting := self._greeting(data)):
                 with contextlib.suppress(OSError):

@@ -17,6 +17,7 @@ import serial
 
 from swarmctl.errors import StartError
 from swarmctl.mavlink import serial_devices
+from swarmctl.mavlink import transport as transport_module
 from swarmctl.mavlink.framing import cut_frames
 from swarmctl.mavlink.transport import (
     Endpoint,
@@ -26,6 +27,7 @@ from swarmctl.mavlink.transport import (
     open_transport,
     parse_url,
 )
+from swarmctl.wall_clock import monotonic_us, utc_us
 from tests.benches.transports import SECOND, frame
 
 
@@ -167,6 +169,22 @@ def test_arrival_is_stamped_by_the_kernel_and_not_by_the_tick_that_drains(bound:
     for stamp_us, expected_us in zip(stamps_us, sent_us, strict=True):
         assert abs(stamp_us - expected_us) < 10_000
     assert stamps_us[0] < stamps_us[1] < now_us
+    vehicle.close()
+
+
+@pytest.mark.parametrize("set_by_us", [-3_600_000_000, 3_600_000_000])
+def test_a_clock_that_is_set_moves_no_arrival_by_more_than_a_tick(
+    bound: socket.socket, monkeypatch: pytest.MonkeyPatch, set_by_us: int
+) -> None:
+    """An arrival an hour ago would look like a silent link, after which the mode of the vehicle is in doubt."""
+    link, vehicle = UdpTransport(bound), client()
+    emptied_us = monotonic_us()
+    assert link.receive(emptied_us) == []
+    vehicle.sendto(b"x", bound.getsockname())
+    monkeypatch.setattr(transport_module, "utc_us", lambda: utc_us() + set_by_us)
+    now_us = monotonic_us()
+    [datagram] = link.receive(now_us)
+    assert emptied_us <= datagram.t_us <= now_us
     vehicle.close()
 
 
