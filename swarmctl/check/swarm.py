@@ -20,7 +20,7 @@ from swarmctl.core.verdict import Verdict
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
-_FAR_M = 30.0  # horizontal distance from the start that is worth a note
+_FAR_M = 30.0  # beside the start, or below it, that is worth a note: heights above the ellipsoid are 50 m off in Europe
 _SLOPE_M = 5.0  # between the lowest and the highest place of a field
 _SWAPPED_BY_M = 0.5  # least saving that reports two vehicles as swapped
 
@@ -92,6 +92,8 @@ def _start(facts: VehicleFacts, config: Config) -> list[Finding]:
         within = f"agent.state_machine.start_timeout_s = {state_machine.start_timeout_s:g}"
         advice = f"it can't get there within {within}: correct swarm.origin_*, or move it; it is not armed"
         return line(FIX, advice, 76)
+    if climb_m > _FAR_M:
+        return line(NOTE, "far below its start; is swarm.origin_alt_m right, above mean sea level?", 7)
     if away_m > _FAR_M:
         return line(NOTE, "far from its start; is the way there free?", 6)
     return line(OK)

@@ -341,6 +341,7 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("start", {"pos_ned_m": (500.0, 0.0, 0.0)}, FIX, "start_timeout_s"),
     ("start", {"pos_ned_m": (0.0, 0.0, 489.0)}, FIX, "swarm.origin_"),
     ("start", {"pos_ned_m": (50.0, 0.0, 0.0)}, NOTE, "far"),
+    ("start", {"pos_ned_m": (0.0, 0.0, 45.0)}, NOTE, "mean sea level"),
     ("COM_OF_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_OF_LOSS_T=3.0)}, FIX, "set 1.0"),
     ("COM_OF_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_OF_LOSS_T=0.05)}, FIX, "set 0.5"),
     ("COM_OF_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_OF_LOSS_T=None)}, NOTE, "not judged"),
