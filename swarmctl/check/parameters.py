@@ -36,7 +36,7 @@ def _checks(dialect: Dialect, config: Config) -> dict[str, ParameterCheck]:
 
 
 def parameter_findings(facts: VehicleFacts, config: Config) -> list[Finding]:
-    """Return one finding per wanted or assessed parameter; none for an unsupported autopilot."""
+    """Return one finding per wanted or assessed parameter; none for an unsupported autopilot or kind of vehicle."""
     dialect = DIALECTS.get(facts.autopilot_number)
     checks = _checks(dialect, config) if dialect is not None else {}
     return [
@@ -69,7 +69,7 @@ def changes(facts: VehicleFacts, config: Config) -> dict[str, Number]:
 
 def _opinions(facts: VehicleFacts, config: Config) -> dict[str, Opinion]:
     dialect = DIALECTS.get(facts.autopilot_number)
-    if dialect is None or facts.parameters is None:
+    if dialect is None or facts.parameters is None or facts.kind_problem:
         return {}
     rules = {rule.name: rule for rule in dialect.rules}
     checks = _checks(dialect, config)

@@ -18,7 +18,7 @@ from swarmctl.mavlink.codec import message_of
 Reader = Callable[[bytes], Any]
 
 _USED = {
-    dialect.MAVLINK_MSG_ID_HEARTBEAT: "autopilot base_mode custom_mode system_status",
+    dialect.MAVLINK_MSG_ID_HEARTBEAT: "type autopilot base_mode custom_mode system_status",
     dialect.MAVLINK_MSG_ID_CURRENT_MODE: "custom_mode",
     dialect.MAVLINK_MSG_ID_ODOMETRY: (
         "time_usec x y z q vx vy vz rollspeed pitchspeed yawspeed frame_id child_frame_id reset_counter"

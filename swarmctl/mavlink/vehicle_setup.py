@@ -76,9 +76,9 @@ class VehicleSetup:
 
     @property
     def refusal(self) -> str:
-        """Reason that forbids arming, or ""; unknown before `ready`."""
-        if not self.ready or self._dialect is None:
-            return ""
+        """Reason that forbids arming, or ""; unknown before `ready`, but for what it is no vehicle to fly."""
+        if self._autopilot.kind_problem or not self.ready or self._dialect is None:
+            return self._autopilot.kind_problem
         heeds = self._dialect.heeds_parameter
         found = [f"{heeds} could not be set to {self._sysid}: {self._failed[heeds]}"] if heeds in self._failed else []
         told, known = self._autopilot.params, self._autopilot.params.keys()

@@ -146,6 +146,7 @@ class VehicleFacts:
     sysid: int = 0
     autopilot: str = ""  # name of the dialect; "" for an unsupported one
     autopilot_number: int = 0  # MAV_AUTOPILOT
+    kind_problem: str = ""  # why it is no vehicle to fly, by its MAV_TYPE
     version: Version | None = None
     mode: FlightMode = FlightMode.UNKNOWN
     custom_mode: int = 0

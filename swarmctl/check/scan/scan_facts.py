@@ -22,6 +22,7 @@ from swarmctl.core.mavlink_values import ARMED_FLAG
 from swarmctl.core.types import FlightMode, GeoOrigin, Landed
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.signing.refusals import in_words
+from swarmctl.mavlink.vehicle.plausibility import kind_problem
 
 _BYTEWISE, _C_CAST = 1 << 4, 1 << 17  # MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_*
 _ENOUGH_ANSWERS = 3
@@ -73,6 +74,7 @@ def facts_of(
         sysid=scan.sysid,
         autopilot="" if dialect is None else dialect.name,
         autopilot_number=beat.autopilot,
+        kind_problem=kind_problem(beat.type),
         version=_version(scan.message("AUTOPILOT_VERSION")),
         mode=FlightMode.UNKNOWN if dialect is None else dialect.mode(beat.custom_mode),
         custom_mode=beat.custom_mode,

@@ -19,6 +19,8 @@ def autopilot(facts: VehicleFacts, config: Config) -> Finding:
     dialect = DIALECTS.get(facts.autopilot_number)
     if dialect is None:
         return line(FIX, f"MAV_AUTOPILOT {facts.autopilot_number}", f"swarmctl flies {' and '.join(_AUTOPILOTS)}", 95)
+    if facts.kind_problem:
+        return line(FIX, facts.autopilot, f"{facts.kind_problem}: it is not armed", 94)
     version = facts.version
     if version is None:
         return line(NOTE, facts.autopilot, "it does not tell its version (AUTOPILOT_VERSION)")

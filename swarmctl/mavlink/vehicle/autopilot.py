@@ -27,6 +27,7 @@ from swarmctl.mavlink.signing.refusals import FrameRefusals
 from swarmctl.mavlink.transport import Transport
 from swarmctl.mavlink.vehicle.local_frame import LocalFrame
 from swarmctl.mavlink.vehicle.mode_watch import ModeWatch
+from swarmctl.mavlink.vehicle.plausibility import kind_problem
 from swarmctl.mavlink.vehicle.setpoint_stream import SetpointStream
 from swarmctl.mavlink.vehicle.state_samples import StateSamples
 from swarmctl.mavlink.vehicle.vehicle_clock import VehicleClock
@@ -68,6 +69,7 @@ class Autopilot:
         frame: the vehicle's local frame.
         params: parameters that the vehicle has reported.
         whole_params: names of the parameters that it stores as integers.
+        kind_problem: why it is no vehicle to fly, by its newest HEARTBEAT, or "".
         armed_told_us: arrival time of the HEARTBEAT that reported `armed`, host clock; -1 before the first.
         hover_thrust_01: thrust with which the autopilot hovers by itself; until observed, the value of its parameter.
         pos_accuracy_m: reported horizontal accuracy, 1 sigma; None while unreported.
@@ -103,7 +105,7 @@ class Autopilot:
         self.watch = ModeWatch()
         self._slow: CommandPort | None = None
         self.dialect: Dialect | None = None
-        self.armed, self.armed_told_us = False, -1
+        self.armed, self.armed_told_us, self.kind_problem = False, -1, ""
         self._texts: deque[AutopilotText] = deque(maxlen=_MOST_TEXTS)
         self.received_us: int | None = None
         self.arrived_us: list[int] = []
@@ -235,7 +237,7 @@ class Autopilot:
         dialect = DIALECTS.get(message.autopilot)
         if dialect is None:
             return
-        self.dialect, mode = dialect, dialect.mode(message.custom_mode)
+        self.dialect, mode, self.kind_problem = dialect, dialect.mode(message.custom_mode), kind_problem(message.type)
         self.armed, self.armed_told_us = bool(message.base_mode & ARMED_FLAG), arrived_us
         self.watch.told(mode, arrived_us, by_heartbeat=True)
         self.watch.status(message.system_status)

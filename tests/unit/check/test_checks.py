@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import development as mavlink
 from rich.console import Console
 
 from swarmctl.check.change import Change
@@ -44,6 +45,7 @@ from swarmctl.mavlink.dialects.dialect import LAND, ODOMETRY, Dialect, LongComma
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.dialects.parameter_check import Opinion, ParameterCheck
 from swarmctl.mavlink.dialects.px4 import PX4
+from swarmctl.mavlink.vehicle.plausibility import kind_problem
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
 URLS = ("udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")
@@ -337,6 +339,7 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ),
     ("clock", {"link_time": VehicleTime(0.0, -30000.0, 100.0)}, NOTE, "short of CPU"),
     ("clock", {"link_time": VehicleTime(0.0, 60000.0, 100.0)}, FIX, "short of CPU"),
+    ("autopilot", {"kind_problem": kind_problem(mavlink.MAV_TYPE_FIXED_WING)}, FIX, "MAV_TYPE fixed wing"),
     ("start", {"pos_ned_m": (0.0, 0.0, -1.8)}, FIX, "origin_alt_m"),
     ("start", {"pos_ned_m": (500.0, 0.0, 0.0)}, FIX, "start_timeout_s"),
     ("start", {"pos_ned_m": (0.0, 0.0, 489.0)}, FIX, "swarm.origin_"),
@@ -633,6 +636,12 @@ MINIMAL: dict[str, Any] = {
     "loss_parameter": "LOSS",
     "landing_parameter": "LANDING",
 }
+
+
+def test_no_parameter_of_a_plane_is_judged_or_set(config: Config) -> None:
+    plane = changed(HEALTHY, kind_problem="it is a plane", parameters=parameters(PX4_VALUES, COM_OF_LOSS_T=3.0))
+    assert changes(plane, with_params(config)) == {}
+    assert exit_code([plane], findings([plane], with_params(config))) == 4
 
 
 def test_a_new_dialect_needs_nothing_but_itself(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,6 +40,7 @@ class Vehicle:
             PX4: {**PX4_WITHOUT_AGENT, **PX4_THRUST, "MIS_TAKEOFF_ALT": TAKEOFF_M},
             ARDUCOPTER: {"GUID_OPTIONS": 8, "GUID_TIMEOUT": 3.0, "MOT_THST_HOVER": 0.35, **COPTER_WITHOUT_AGENT},
         }
+        self.kind = mavlink.MAV_TYPE_QUADROTOR
         self.autopilot, self.params = autopilot, {**defaults[autopilot], **params}
         self.clock = SimClock()
         self.ours, self.theirs = pipe_pair(self.clock.now_us)
@@ -92,7 +93,7 @@ class Vehicle:
             for frame in frames(datagram.data):
                 self._hear(self.codec.decode(frame))
         if self.clock.now_us() % 1_000_000 == 0:
-            self.say(mavlink.MAVLink_heartbeat_message(2, self.autopilot, 1, 4 << 16 | 3 << 24, 3, 3))
+            self.say(mavlink.MAVLink_heartbeat_message(self.kind, self.autopilot, 1, 4 << 16 | 3 << 24, 3, 3))
         nothing = [0.0] * 21
         boot_ms = self.stamp_us // 1000
         if 331 in self.rates_hz:
@@ -204,6 +205,26 @@ def test_what_a_parameter_would_do_in_flight_is_refused_before_it(vehicle: Vehic
     vehicle.run(12.0)
     assert vehicle.vehicle_setup.ready
     assert re.search(why, vehicle.vehicle_setup.refusal)
+
+
+@pytest.mark.parametrize("autopilot", [PX4, ARDUCOPTER])
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        (mavlink.MAV_TYPE_FIXED_WING, "fixed wing"),
+        (mavlink.MAV_TYPE_GROUND_ROVER, "ground rover"),
+        (mavlink.MAV_TYPE_VTOL_TILTROTOR, "vtol tiltrotor"),
+        (250, "250"),
+        (mavlink.MAV_TYPE_HEXAROTOR, ""),
+        (mavlink.MAV_TYPE_GENERIC, ""),
+    ],
+)
+def test_only_what_hovers_is_flown(autopilot: int, kind: int, said: str) -> None:
+    """ArduPlane and ArduRover name the autopilot of ArduCopter, and number other modes by its numbers."""
+    vehicle = Vehicle(autopilot, GUID_TIMEOUT=1.0) if autopilot == ARDUCOPTER else Vehicle(autopilot)
+    vehicle.kind = kind
+    refusal = vehicle.set_up().run(4.0).vehicle_setup.refusal
+    assert refusal == (f"it says to be of MAV_TYPE {said}, and only multirotors are flown" if said else "")
 
 
 def test_an_offboard_loss_action_that_could_not_be_set_or_read_is_refused() -> None:
