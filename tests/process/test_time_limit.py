@@ -48,3 +48,19 @@ def test_an_operators_hold_has_no_end(tmp_path: Path, monkeypatch: pytest.Monkey
     services.held, services.ends_s = held, time.monotonic()
     result = services.fly("mission.duration_s=1")
     assert result.outcome == ("completed" if held else "failed")
+
+
+@pytest.mark.parametrize(("connect_timeout_s", "outcome"), [(15.0, "completed"), (0.5, "failed")])
+def test_an_agent_may_wait_for_its_vehicle_as_long_as_it_is_told_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, connect_timeout_s: float, outcome: str
+) -> None:
+    """With `connect_timeout_s = 300` a launch ended after 90 s."""
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_VEHICLE_S", 1.0)
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_SET_UP_S", 0.5)
+    services = ScriptedServices(tmp_path, [ends(0, 4.0)])
+    services.phase = Phase.CONNECT
+    result = services.fly(f"agent.connect_timeout_s={connect_timeout_s}")
+    assert result.outcome == outcome
+    assert any("hears no vehicle at the built-in SITL after 1 s" in text for text in result.problems) == (
+        outcome == "failed"
+    )

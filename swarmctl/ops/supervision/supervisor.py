@@ -41,7 +41,8 @@ ESSENTIAL_ENDED = {ROUTER: "router_ended", SITL: "sitl_ended"}  # event of the e
 
 _STEP_S = 0.05
 _FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
-_VEHICLE_S = 90.0  # timeout for every agent to receive its vehicle
+_VEHICLE_S = 90.0  # least timeout for every agent to receive its vehicle, and set it up
+_SET_UP_S = 30.0  # of it, beyond `agent.connect_timeout_s`
 _BEYOND_MISSION_S = 300.0  # for take-off, waiting and landing; a longer flight is ended
 _TIMED = (Phase.TRACK, Phase.GOTO_LAND)  # phases whose end is known
 _SILENCE_S = 5.0
@@ -109,6 +110,7 @@ class FlightSupervisor:
         self._started_s = time.monotonic()
         self._own_pause = OwnPause(self._started_s)
         self._mission_ends_s = self._started_s + config.mission.duration_s  # at the earliest
+        self._vehicle_s = max(_VEHICLE_S, config.agent.connect_timeout_s + _SET_UP_S)
         self._reported: set[str] = set()
         self._router_starts = 0  # how often it was started again
         self._essential_lost = False  # an essential process, router or simulator, has ended
@@ -266,7 +268,7 @@ class FlightSupervisor:
         )
 
     def _check_responsive(self, view: AgentView, child: Child, now_s: float) -> None:
-        waited_s = now_s - self._started_s
+        waited_s, no_vehicle = now_s - self._started_s, f"{child.name} vehicle"
         if view.status is None:
             if waited_s > _FIRST_STATUS_S and self._is_first(f"{child.name} unresponsive"):
                 self._refuse(f"{child.name} is not on the bus after {_FIRST_STATUS_S:.0f} s; see {child.log}")
@@ -283,10 +285,10 @@ class FlightSupervisor:
         elif view.note:
             view.note = ""
             self._announce("agent_back", f"{child.name} responds again")
-        elif view.status.phase == Phase.CONNECT and waited_s > _VEHICLE_S and self._is_first(f"{child.name} vehicle"):
+        elif view.status.phase == Phase.CONNECT and waited_s > self._vehicle_s and self._is_first(no_vehicle):
             url = self._config.vehicles[view.agent].url if self._config.vehicles else "the built-in SITL"
             self._refuse(
-                f"{child.name} hears no vehicle at {url} after {_VEHICLE_S:.0f} s; check that it is on and sends"
+                f"{child.name} hears no vehicle at {url} after {self._vehicle_s:.0f} s; check that it is on and sends"
             )
 
     def _end_if_frozen(self, child: Child, now_s: float) -> None:
