@@ -106,6 +106,22 @@ def test_who_has_landed_does_not_fail_because_it_waits_for_one_that_does_not(
     assert EndedMessage(agent=0, boot_id=1, is_down=True) in told, "agents of other computers hear nothing more of it"
 
 
+@pytest.mark.parametrize(
+    ("phase", "landing_s", "is_late"), [(Phase.LAND, 300.0, False), (Phase.LAND, 2.0, True), (Phase.TRACK, 300.0, True)]
+)
+def test_who_is_heard_landing_is_not_killed_on_its_way_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: Phase, landing_s: float, is_late: bool
+) -> None:
+    """After Ctrl-C at a height of 90 m agents were killed before touchdown, and the flight had failed."""
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_LAND_S", 1.0)
+    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_LANDING_S", landing_s, raising=False)
+    services = ScriptedServices(tmp_path, [ends(EXIT_INTERRUPTED, 5.0)])
+    services.phase, services.obeys = phase, False
+    services.act = lambda: setattr(services, "interrupts", 1)
+    problems = services.fly().problems
+    assert any("did not end in time and was killed" in text for text in problems) == is_late
+
+
 def test_an_agent_that_ends_between_two_looks_still_says_how_it_ended(tmp_path: Path) -> None:
     services = ScriptedServices(tmp_path, [ends(EXIT_INTERRUPTED)])
     agent = services.children[agent_name(0)]

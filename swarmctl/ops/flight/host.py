@@ -143,7 +143,7 @@ WorkingDirectory=%h
 Restart=no
 KillMode=mixed
 KillSignal=SIGINT
-TimeoutStopSec=180
+TimeoutStopSec=420
 LimitRTPRIO=20
 """
 

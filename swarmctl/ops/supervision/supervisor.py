@@ -48,6 +48,7 @@ _TIMED = (Phase.TRACK, Phase.GOTO_LAND)  # phases whose end is known
 _SILENCE_S = 5.0
 _STANDSTILL_S = 5.0  # of a silent agent, after which it is ended
 _LAND_S = 60.0  # for agents to land that are told to; later they are killed
+_LANDING_S = 300.0  # instead, for those that are heard landing: from 90 m it takes more than a minute
 _LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
 _ROUTER_STARTS = 3  # in one flight
@@ -336,7 +337,7 @@ class FlightSupervisor:
         if any(_end_of(child) not in self._reported for child in self._agents() if child.poll() is not None):
             return False  # it has ended since the agents were watched, and may say how the flight went
         if self._land_ordered_s is not None and now_s > self._land_until_s:
-            self._end_late([view for view in running if not self._is_recovered(view)])
+            self._end_late([v for v in running if not (self._is_recovered(v) or self._is_landing(v, now_s))])
             return not running
         if not running:
             deaths_s = [
@@ -354,6 +355,14 @@ class FlightSupervisor:
         """Return whether its vehicle is being landed, which has a time of its own."""
         agent = view.agent
         return self._recovery.is_on(agent) and not (self._vehicles_lost or self._recovery.is_overdue(agent))
+
+    def _is_landing(self, view: AgentView, now_s: float) -> bool:
+        """Return whether an agent does what it was ordered to, and has the time that this takes."""
+        status = view.status
+        if status is None or status.held or view.note == "silent" or self._vehicles_lost:
+            return False
+        since_s = now_s - (self._land_ordered_s or now_s)
+        return Phase.GOTO_LAND <= status.phase < Phase.DONE and since_s <= _LANDING_S
 
     def _end_late(self, running: list[AgentView]) -> None:
         """Kill who has not landed in time, and who is done and only waits for those."""
