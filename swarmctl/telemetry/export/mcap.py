@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
-from swarmctl.core.recorded.records import TRUTH_COLUMNS
+from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_COLUMNS
 from swarmctl.core.recorded.stored_column import StoredColumn
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Array
@@ -46,6 +46,7 @@ _BODY_M, _REFERENCE_M, _GOAL_M = (0.4, 0.4, 0.08), 0.06, 0.2  # sizes drawn: a p
 _SCENE_TICKS = 5  # of an agent, between two of its pictures: ten a second
 _PLAN_PERIOD_US, _OBSTACLE_STEP_US = 100_000, 200_000
 _BLOCK = 4096  # rows turned into words at once
+_NO_TICKS = np.zeros(0, TICK_DTYPE)
 _JSON_TYPES = {"f": "number", "i": "integer", "u": "integer"}  # by the kind of a numpy type
 _WARNINGS = ("outside_volume", "overload", "estimate_jumped", "order_refused", "refused", "unresponsive")
 _ERRORS = ("controller_failed", "start_failed", "not_landed", "vehicle_left", "too_long", "killed")
@@ -95,6 +96,12 @@ def _begins_us(run: RunData) -> int:
     return min((int(rows["utc_us"][0]) for rows in run.ticks.values() if len(rows)), default=0)
 
 
+def _utc_us(ticks: NDArray[np.void], t_us: Any) -> Any:
+    """Return the UTC of monotonic times, as ticks (T,) have it: it follows a clock that was set in flight slowly."""
+    ahead_us = np.interp(t_us, ticks["t_us"], ticks["utc_us"] - ticks["t_us"]) if len(ticks) else 0.0
+    return t_us + np.rint(ahead_us).astype(np.int64)
+
+
 class _Export:
     """Logs a run to the channels of a context, in order of time."""
 
@@ -110,15 +117,14 @@ class _Export:
 
     def write(self) -> None:
         truth = self._recorded.run.truth
-        first = next(iter(self._ticks.values()), None)
-        utc_minus_host_us = 0 if first is None else int(first["utc_us"][0]) - int(first["t_us"][0])
+        first = next(iter(self._ticks.values()), _NO_TICKS)
         streams = [self._still(), self._event_logs(), *self._obstacles()]
         for agent, rows in self._ticks.items():
             streams += [self._vehicle(agent, rows), self._plans(agent, rows), self._goals(agent, rows)]
             streams.append(self._values(f"/agent/{agent}/tick", COLUMNS, rows, rows["utc_us"]))
         for vehicle in np.unique(truth["vehicle"]):
             rows = truth[truth["vehicle"] == vehicle]
-            streams.append(self._values(f"/truth/{vehicle}", TRUTH_COLUMNS, rows, rows["t_us"] + utc_minus_host_us))
+            streams.append(self._values(f"/truth/{vehicle}", TRUTH_COLUMNS, rows, _utc_us(first, rows["t_us"])))
         for utc_us, log in heapq.merge(*streams, key=lambda message: message[0]):
             log(log_time=utc_us * 1000)
 
@@ -159,10 +165,9 @@ class _Export:
 
     def _plans(self, agent: int, rows: NDArray[np.void]) -> Messages:
         """Yield the predicted paths of an agent."""
-        offset_us = int(rows["utc_us"][0]) - int(rows["t_us"][0])
         for t_us, points_ned_m in _paths(self._recorded.plans.get(agent)):
             line = self._line(points_ned_m, (*agent_rgb(agent), 200))
-            yield self._draw(t_us + offset_us, f"plan-{agent}", _NED, lines=[line])
+            yield self._draw(int(_utc_us(rows, t_us)), f"plan-{agent}", _NED, lines=[line])
 
     def _obstacles(self) -> Iterator[Messages]:
         """Yield what draws each obstacle, until the next one of its number begins."""

@@ -22,7 +22,7 @@ from swarmctl.bus.messages.json_messages import first_list
 from swarmctl.config import Config, dump
 from swarmctl.configuration.sections import SwarmParams
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.recorded.records import TICK_DTYPE
+from swarmctl.core.recorded.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
@@ -138,6 +138,23 @@ def test_events_of_a_station_are_exported_by_its_clock(folder: Path, tmp_path: P
     (directory / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
     (time_ns,) = [at_ns for at_ns, log in messages(export_mcap(directory, None), "/events") if log.name == "agent-1"]
     assert time_ns == (utc_us + 5) * 1000
+
+
+def test_true_states_and_predicted_paths_follow_a_clock_that_was_set_in_flight(folder: Path, tmp_path: Path) -> None:
+    """As on a computer that has begun in 1970: its UTC gains 1 % on the true states, 6 s in ten minutes."""
+    directory = shutil.copytree(folder, tmp_path / "set")
+    rows = read_parquet(directory / "agent-0.parquet")
+    rows["utc_us"] += (rows["t_us"] - rows["t_us"][0]) // 100
+    write_parquet(directory / "agent-0.parquet", rows)
+    plans = np.zeros(2 * len(rows), PLAN_DTYPE)
+    plans["t_us"] = np.repeat(rows["t_us"], 2)
+    write_parquet(directory / "agent-0.plans.parquet", plans, PLAN_COLUMNS)
+    path = export_mcap(directory, None)
+    at_ns = {topic: [time_ns for time_ns, _ in messages(path, topic)] for topic in ("/agent/0/tick", "/truth/0")}
+    assert at_ns["/truth/0"] == at_ns["/agent/0/tick"]
+    drawn_ns = [at_ns for at_ns, scene in messages(path, "/scene") if [e.id for e in scene.entities] == ["plan-0"]]
+    assert len(drawn_ns) > 20
+    assert set(drawn_ns) <= set(at_ns["/agent/0/tick"])
 
 
 def test_the_summary_is_attached_as_it_is(folder: Path, path: Path) -> None:
