@@ -71,7 +71,11 @@ def tick_for_ever(endpoint: str, way: str, agents: int, own: Sequence[int]) -> N
 
 def measured(way: str, agents: int, processes: int, seconds: float) -> Load:
     """Run a swarm one way, and return what it takes."""
-    endpoint = f"{SCHEME}{tempfile.mkdtemp(prefix='swarm-cost-')}/bus.sock"
+    with tempfile.TemporaryDirectory(prefix="swarm-cost-") as folder:
+        return _measured(f"{SCHEME}{folder}/bus.sock", way, agents, processes, seconds)
+
+
+def _measured(endpoint: str, way: str, agents: int, processes: int, seconds: float) -> Load:
     router = start_router(endpoint)
     shares = [range(agents)[i::processes] for i in range(processes)]
     started = [

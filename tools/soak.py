@@ -19,6 +19,7 @@ import numpy as np
 import psutil
 
 from swarmctl.core.types import Phase
+from swarmctl.telemetry.recording.file_names import AGENT_FILE
 from swarmctl.telemetry.recording.run_files import read_parquet
 
 _SAMPLE_S = 10.0
@@ -46,7 +47,9 @@ def resident_bytes(launch: psutil.Process) -> dict[str, int]:
 
 
 def growth(samples: list[tuple[float, dict[str, int]]]) -> dict[str, dict[str, float]]:
-    """Return resident megabytes after the first tenth of the samples, at their end, and the growth between."""
+    """Return resident megabytes after the first tenth of the samples, at their end, and the growth; {} without any."""
+    if not samples:
+        return {}
     settled, last = samples[len(samples) // _PARTS][1], samples[-1][1]
     return {
         name: {
@@ -62,7 +65,8 @@ def growth(samples: list[tuple[float, dict[str, int]]]) -> dict[str, dict[str, f
 def tick_p99_ms(directory: Path) -> dict[str, list[float]]:
     """Return the 99th percentile of the tick time of each agent in each tenth of the mission."""
     found = {}
-    for path in sorted(directory.glob("agent-?.parquet")):
+    paths = {int(match[1]): path for path in directory.iterdir() if (match := AGENT_FILE.match(path.name))}
+    for _, path in sorted(paths.items()):
         rows = read_parquet(path)
         tick_ms = rows["tick_ms"][rows["phase"] == Phase.TRACK]
         found[path.stem] = [round(float(np.percentile(part, 99)), 2) for part in np.array_split(tick_ms, _PARTS)]
