@@ -76,15 +76,15 @@ class StartConditions:
         return problem or self._who_is_beside(state, others_ned_m, now_us, away_for_us=_APART_FOR_US)
 
     def _far_start(self, state: VehicleState | None) -> str:
-        """Return that the start is too far from where the vehicle stands, or ""."""
-        if self._mission.phase > Phase.STANDBY or state is None or state.landed is not Landed.ON_GROUND:
+        """Return that the start is too far from where the vehicle is, or ""."""
+        if self._mission.phase > Phase.STANDBY or state is None or state.landed is Landed.UNKNOWN:
             return ""
         place, start = state.pos_ned_m.tolist(), self._setup.starts_ned_m[self._setup.agent].tolist()
         if not is_beyond_reach(place, start, self._setup.params.state_machine):
             return ""
         away_m, climb_m = math.dist(place[:2], start[:2]), place[2] - start[2]
         return (
-            f"its start to be within reach (it stands {away_m:.0f} m beside it, {climb_m:.0f} m below): correct "
+            f"its start to be within reach (it is {away_m:.0f} m beside it, {climb_m:.0f} m below): correct "
             "swarm.origin_*, or move it"
         )
 

@@ -48,9 +48,9 @@ def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[i
 
 
 def is_beyond_reach(pos_ned_m: Sequence[float], start_ned_m: Sequence[float], params: StateMachineParams) -> bool:
-    """Return whether a vehicle that stands at (3,) can't be at its start (3,) in time.
+    """Return whether a vehicle at (3,) can't be at its start (3,) in time.
 
-    It is most often the shared origin that is somewhere else: the autopilot would climb to that height all the same.
+    It is most often the shared origin that is somewhere else: an autopilot would climb to that height all the same.
     """
     away_m, climb_m = math.dist(pos_ned_m[:2], start_ned_m[:2]), max(0.0, pos_ned_m[2] - start_ned_m[2])
     return away_m / params.speed_m_s + climb_m / _CLIMBS_M_S > params.start_timeout_s

@@ -95,10 +95,12 @@ def test_nobody_is_armed_beside_another_vehicle_until_that_has_been_away_for_a_w
     [
         ((0.0, 0.0, 85.0), Landed.ON_GROUND, ""),
         ((170.0, 0.0, 2.0), Landed.ON_GROUND, ""),
-        ((0.0, 0.0, 489.0), Landed.ON_GROUND, "(it stands 0 m beside it, 489 m below): correct swarm.origin_*"),
-        ((300.0, -400.0, 2.0), Landed.ON_GROUND, "(it stands 500 m beside it, 2 m below): correct swarm.origin_*"),
-        ((100.0, 0.0, 50.0), Landed.ON_GROUND, "(it stands 100 m beside it, 50 m below): correct swarm.origin_*"),
-        ((300.0, -400.0, 2.0), Landed.IN_AIR, ""),
+        ((0.0, 0.0, 489.0), Landed.ON_GROUND, "(it is 0 m beside it, 489 m below): correct swarm.origin_*"),
+        ((300.0, -400.0, 2.0), Landed.ON_GROUND, "(it is 500 m beside it, 2 m below): correct swarm.origin_*"),
+        ((100.0, 0.0, 50.0), Landed.ON_GROUND, "(it is 100 m beside it, 50 m below): correct swarm.origin_*"),
+        ((300.0, -400.0, 2.0), Landed.IN_AIR, "(it is 500 m beside it, 2 m below): correct swarm.origin_*"),
+        ((170.0, 0.0, -200.0), Landed.IN_AIR, ""),
+        ((300.0, -400.0, 2.0), Landed.UNKNOWN, ""),
     ],
 )
 def test_nobody_is_armed_whose_start_is_somewhere_else(
