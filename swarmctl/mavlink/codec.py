@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from swarmctl.mavlink.framing import frames, message_id
 _VERSION_2, _PLAIN = 0xFD, 0  # first byte of a frame; incompatibility flags of one that is not signed
 _HEADER_BYTES, _HEADER_BYTES_1, _CHECKSUM_BYTES = 10, 6, 2  # the second of MAVLink 1
 _HEADER = struct.Struct("<BBBBBBBHB")
+_LARGEST_NUMBER = 0xFFFF  # of a message in any dialect; a header that is none has most often a larger one
 _UNKNOWN = "unknown message"  # its checksum can't be verified
 
 
@@ -37,7 +38,7 @@ class _Layout(NamedTuple):
     texts: tuple[int, ...]  # arguments that are bytes padded with zeros
 
 
-@cache
+@lru_cache(maxsize=1024)  # as many as there are: the numbers of damaged frames have no end
 def _layout(number: int) -> _Layout | None:
     """Return the layout of a message of the dialect; None for an unknown one."""
     kind = dialect.mavlink_map.get(number)
@@ -88,11 +89,13 @@ def heartbeat_of(sysid: int) -> Callable[[bytes], bool]:
     return beats
 
 
-def is_damaged(frame: bytes) -> bool:
-    """Return whether the checksum of a frame of MAVLink 2 is wrong, as after noise; not known of unknown messages."""
-    layout, end = _layout(message_id(frame)), _HEADER_BYTES + frame[1]
-    checksum = int.from_bytes(frame[end : end + _CHECKSUM_BYTES], "little")
-    return layout is not None and bool(mcrf4xx(frame[1:end] + layout.seed) != checksum)
+def is_intact(frame: bytes) -> bool | None:
+    """Return whether the checksum of a MAVLink 2 frame is right; None of unknown messages, where nobody can tell."""
+    number, end = message_id(frame), _HEADER_BYTES + frame[1]
+    layout = _layout(number)
+    if layout is None:
+        return None if number <= _LARGEST_NUMBER else False
+    return bool(mcrf4xx(frame[1:end] + layout.seed) == int.from_bytes(frame[end : end + _CHECKSUM_BYTES], "little"))
 
 
 class Codec:

@@ -1,4 +1,4 @@
-"""Frame boundaries of MAVLink in streams of bytes, received and sent. Checksums are not verified here."""
+"""Frame boundaries of MAVLink in streams of bytes, received and sent. Who passes a judge has checksums verified."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ from collections.abc import Callable
 _START_2 = re.compile(b"\xfd")
 _START_1_OR_2 = re.compile(b"[\xfd\xfe]")
 _VERSION_2 = 0xFD
+Judge = Callable[[bytes], bool | None]  # whether the checksum of a frame is right; None: it can't be verified
 _FIRST_BYTES = 3  # they tell the length of a frame
 _AROUND_1, _AROUND_2, _SIGNATURE = 8, 12, 13  # bytes of header and checksum by version, and of a signature
 _SIGNED = 1
 
 
-def cut_frames(buffer: bytearray, version_1: bool = False) -> list[bytes]:
+def cut_frames(buffer: bytearray, version_1: bool = False, judge: Judge | None = None) -> list[bytes]:
     """Remove and return all complete MAVLink 2 frames at the front of `buffer`; junk before a start byte is dropped.
 
-    With `version_1`, MAVLink 1 frames are returned too; otherwise they are junk.
+    Args:
+        buffer: what has arrived.
+        version_1: MAVLink 1 frames are returned too; otherwise they are junk.
+        judge: for streams that lose bytes: what a damaged frame says of its length takes others away with it, so that
+            frames are looked for within it, too. It is returned before them, to be refused and counted.
     """
     start_byte = _START_1_OR_2 if version_1 else _START_2
     found: list[bytes] = []
@@ -34,8 +39,15 @@ def cut_frames(buffer: bytearray, version_1: bool = False) -> list[bytes]:
             length = _AROUND_1 + buffer[1]
         if len(buffer) < length:
             return found
-        found.append(bytes(buffer[:length]))
-        del buffer[:length]
+        frame = bytes(buffer[:length])
+        is_good = True if judge is None else judge(frame)
+        if is_good is None:  # of an unknown message: then what follows has to begin as a frame
+            is_good = length == len(buffer) or start_byte.match(buffer, length) is not None
+        elif not is_good:
+            found.append(frame)
+        if is_good:
+            found.append(frame)
+        del buffer[: length if is_good else 1]
 
 
 def frames(datagram: bytes, version_1: bool = False) -> list[bytes]:

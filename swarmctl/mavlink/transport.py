@@ -20,6 +20,7 @@ from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 from swarmctl.errors import StartError
+from swarmctl.mavlink.codec import is_intact
 from swarmctl.mavlink.framing import FrameWriter, cut_frames
 from swarmctl.mavlink.latch import Address, Greeting, IsVehicle, Latch, admit_only, anybody, silence
 from swarmctl.mavlink.serial_devices import serial_problem
@@ -311,7 +312,7 @@ class TcpTransport:
 
 
 class SerialTransport:
-    """A serial port that cuts frames out of the byte stream; it is reopened after it was unplugged.
+    """A serial port that cuts frames out of a byte stream with gaps; it is reopened after it was unplugged.
 
     No other program of ours shares it: each would read bytes of the other's frames. Frames that do not fit into the
     output buffer are dropped whole.
@@ -357,7 +358,7 @@ class SerialTransport:
         except OSError:
             self._lost = True
             return []
-        return [Datagram(now_us, frame) for frame in cut_frames(self._buffer)]
+        return [Datagram(now_us, frame) for frame in cut_frames(self._buffer, judge=is_intact)]
 
     def close(self) -> None:
         if self._port is not None:

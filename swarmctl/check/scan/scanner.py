@@ -24,7 +24,7 @@ from swarmctl.core.mavlink_values import (
     ONBOARD_CONTROLLER,
     PREARM_CHECK,
 )
-from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.codec import Codec, is_intact
 from swarmctl.mavlink.dialects.dialect import Dialect
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.framing import frames, message_id
@@ -215,8 +215,8 @@ class VehicleScan:
             if compid != AUTOPILOT_COMPID:
                 continue
             message = self._codec.decode(frame)
-            if message is None and frame[0] == mavlink.PROTOCOL_MARKER_V1:
-                continue
+            if message is None and (frame[0] == mavlink.PROTOCOL_MARKER_V1 or is_intact(frame) is False):
+                continue  # a damaged frame has no sequence number that counts
             self._count(frame, heard.sender)
             statistics = self.statistics.setdefault(sysid, FrameStatistics())
             statistics.frame(seq, len(frame))

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from swarmctl.mavlink.codec import is_damaged
+from swarmctl.mavlink.codec import is_intact
 from swarmctl.mavlink.signing.refusals import DAMAGED, FUTURE, OLD, REPLAYED, UNSIGNED, WRONG_SIGNATURE, FrameRefusals
 from swarmctl.mavlink.signing.signature import (
     MOST_STAMP,
@@ -95,7 +95,7 @@ class SigningChannel:
         if not is_signed(frame):
             return UNSIGNED, _NO_STREAM, 0
         if not is_authentic(frame, self._key):
-            return (DAMAGED if is_damaged(frame) else WRONG_SIGNATURE), _NO_STREAM, 0
+            return (DAMAGED if is_intact(frame) is False else WRONG_SIGNATURE), _NO_STREAM, 0
         stream, stamp = origin(frame)
         if stamp <= self._began:
             return OLD, stream, stamp

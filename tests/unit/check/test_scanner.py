@@ -412,6 +412,16 @@ def test_lost_frames(seqs: Sequence[int], lost: int) -> None:
     assert statistics.lost_01(dropped=lost) == 0.0
 
 
+def test_a_frame_that_arrives_damaged_is_lost(listener: ScriptedListener) -> None:
+    scan, codec = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0), Codec(1, 1)
+    for k in range(100):
+        beat = bytearray(codec.encode(mavlink.MAVLink_heartbeat_message(2, PX4, 0, HOLD, 4, 3)))
+        beat[12] ^= k % 10 == 5
+        listener.inbox.append(ReceivedDatagram(listener.now_us, bytes(beat), STRANGER))
+    scan.step(listener.now_us)
+    assert (scan.statistics[1].frames, scan.statistics[1].lost) == (90, 10)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
 def test_what_a_busy_computer_drops_is_not_lost_on_the_way() -> None:
     """Nobody reads while more arrives than the queue takes, as when the processor is busy; two are lost on the way."""

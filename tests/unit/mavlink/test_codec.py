@@ -7,12 +7,14 @@ import random
 import struct
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
-from swarmctl.mavlink.codec import Codec, message_of
+from swarmctl.mavlink import codec as codec_module
+from swarmctl.mavlink.codec import Codec, is_intact, message_of
 from swarmctl.mavlink.framing import cut_frames, frames, message_id
 
 CRC_EXTRA = {0: 50, 76: 152, 82: 49, 331: 91}  # of common.xml, by message id
@@ -122,6 +124,41 @@ def test_a_datagram_of_several_frames_is_split() -> None:
     parts = [codec.encode(heartbeat()) for _ in range(3)]
     assert list(frames(b"".join(parts))) == parts
     assert [message_id(part) for part in parts] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("gap", [1, 2, 7, 30])
+def test_a_gap_in_a_stream_costs_the_frame_that_it_is_in_and_no_other(gap: int) -> None:
+    """As on a telemetry radio, which loses bytes: the length of a damaged frame reaches into the next one."""
+    codec, rng = Codec(1, 1), np.random.default_rng([3, gap])
+    stream, intact, buffer, got = bytearray(), [], bytearray(), []
+    for k in range(400):
+        q = [float(part) for part in rng.normal(size=4)]
+        frame = codec.encode(dialect.MAVLink_attitude_quaternion_message(20 * k, *q, 0.1, 0.2, 0.3))
+        at = int(rng.integers(0, len(frame) - gap + 1))
+        is_whole = k % 5 != 3
+        stream += frame if is_whole else frame[:at] + frame[at + gap :]
+        intact += [frame] if is_whole else []
+    stream += bytes(280)  # the longest frame that a damaged one can be taken for
+    for begin in range(0, len(stream), 50):
+        buffer += stream[begin : begin + 50]
+        got += cut_frames(buffer, judge=is_intact)
+    assert [frame for frame in got if is_intact(frame)] == intact
+    assert sum(is_intact(frame) is False for frame in got) > 60, "damaged ones are there to be counted"
+
+
+def test_a_message_that_nobody_knows_ends_where_the_next_frame_begins() -> None:
+    known = Codec(1, 1).encode(dialect.MAVLink_ping_message(1, 2, 3, 4))
+    unknown = known[:7] + b"\xff\xff\x00" + known[10:]
+    assert is_intact(unknown) is None
+    assert cut_frames(bytearray(known + unknown + known + unknown), judge=is_intact) == [known, unknown] * 2
+    assert cut_frames(bytearray(unknown[:-3] + known), judge=is_intact) == [known]
+
+
+def test_made_up_numbers_of_messages_fill_no_memory() -> None:
+    frame = Codec(1, 1).encode(dialect.MAVLink_ping_message(1, 2, 3, 4))
+    for number in range(1 << 20, (1 << 20) + 3000):
+        assert is_intact(frame[:7] + number.to_bytes(3, "little") + frame[10:]) is False
+    assert codec_module._layout.cache_info().currsize <= 1024
 
 
 def test_a_signed_frame_takes_its_signature_with_it() -> None:

@@ -14,10 +14,12 @@ from pathlib import Path
 
 import pytest
 import serial
+from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.errors import StartError
 from swarmctl.mavlink import serial_devices
 from swarmctl.mavlink import transport as transport_module
+from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import cut_frames
 from swarmctl.mavlink.transport import (
     Endpoint,
@@ -257,6 +259,24 @@ def test_serial_passes_on_whole_frames() -> None:
     assert [d.data for d in link.receive(99)] == [good]
     link.send(good)
     assert os.read(master, 100) == good
+    link.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_a_byte_that_a_serial_line_loses_costs_one_frame() -> None:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    link = SerialTransport(os.ttyname(slave), 57600)
+    codec = Codec(1, 1)
+    sent = [codec.encode(mavlink.MAVLink_ping_message(7, k, 1, 1)) for k in range(4)]
+    os.write(master, sent[0] + sent[1][:15] + sent[1][16:] + sent[2] + sent[3])
+    found: list[bytes] = []
+    until_s = time.monotonic() + 5.0
+    while sent[3] not in found and time.monotonic() < until_s:
+        found += [datagram.data for datagram in link.receive(0)]
+    assert [data for data in found if codec.payload(data) is not None] == [sent[0], sent[2], sent[3]]
+    assert codec.refused.total() == 1
     link.close()
     os.close(master)
     os.close(slave)
