@@ -158,9 +158,10 @@ class VehicleSetup:
     def _compare(self) -> None:
         """Queue a command for each value that differs from the wanted one; without any, the link is set up.
 
-        The take-off height is kept to be restored, too, whatever it is: the climb sets it.
+        The take-off height is kept to be restored, too, whatever it is: the climb sets it. Of a vehicle that is not to
+        be flown nothing is set.
         """
-        if self._compared:
+        if self._compared or self._autopilot.kind_problem:
             self.ready = True
             return
         assert self._dialect is not None

@@ -221,9 +221,11 @@ def test_what_a_parameter_would_do_in_flight_is_refused_before_it(vehicle: Vehic
 )
 def test_only_what_hovers_is_flown(autopilot: int, kind: int, said: str) -> None:
     """ArduPlane and ArduRover name the autopilot of ArduCopter, and number other modes by its numbers."""
-    vehicle = Vehicle(autopilot, GUID_TIMEOUT=1.0) if autopilot == ARDUCOPTER else Vehicle(autopilot)
-    vehicle.kind = kind
-    refusal = vehicle.set_up().run(4.0).vehicle_setup.refusal
+    vehicle = Vehicle(PX4, COM_DL_LOSS_T=10) if autopilot == PX4 else Vehicle(ARDUCOPTER, GUID_TIMEOUT=1.0)
+    vehicle.kind, before = kind, dict(vehicle.params)
+    refusal = vehicle.set_up().run(12.0).vehicle_setup.refusal
+    assert vehicle.vehicle_setup.ready
+    assert (vehicle.params == before) == bool(said), "nothing is set of a vehicle that is not flown"
     assert refusal == (f"it says to be of MAV_TYPE {said}, and only multirotors are flown" if said else "")
 
 
