@@ -60,10 +60,13 @@ def give_way() -> None:
     """Let this process, and all that it starts from now on, have the processor time that others leave.
 
     Linux weighs sessions against each other where it groups processes by them (`autogroup`), and there the niceness of
-    a process counts within its session only.
+    a process counts within its session only. So a process with a session of its own lowers that one too; in the session
+    of others, as a terminal's, it would slow them down, and for good.
     """
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, WATCHER_NICE)
+    if os.getsid(0) != os.getpid():
+        return
     with contextlib.suppress(OSError):  # it is not Linux, or does not group
         Path("/proc/self/autogroup").write_text(f"{WATCHER_NICE}", encoding="ascii")
 
