@@ -66,19 +66,17 @@ def _missing_truth(
     if not len(truth):
         return
     known_us = np.unique(truth["t_us"]).astype(np.float64)
-    flown_us = np.unique(np.concatenate([np.zeros(0), *map(_flown_us, ticks.values())]))
+    flown_us = np.concatenate([np.zeros(0), *map(_flown_us, ticks.values())])
     before_us = np.concatenate([[-np.inf], known_us])[np.searchsorted(known_us, flown_us, "right")]
     after_us = np.concatenate([known_us, [np.inf]])[np.searchsorted(known_us, flown_us)]
     hidden = (flown_us - before_us > _AFTER_US) & (after_us - flown_us > _BEFORE_US)
     if not hidden.any():
         return
-    ends = {(before, after) for before, after in zip(before_us[hidden], after_us[hidden], strict=True)}
-    first_us, last_us = float(flown_us[hidden][0]), float(flown_us[hidden][-1])
-    gaps = [
-        (before if np.isfinite(before) else first_us, after if np.isfinite(after) else last_us)
-        for before, after in ends
-    ]
-    seconds, since_s = sum(end - begin for begin, end in gaps) / 1e6, at_s(min(begin for begin, _ in gaps))
+    begins_us, at = np.unique(before_us[hidden], return_index=True)  # each gap once
+    ends_us = after_us[hidden][at]
+    begins_us = np.where(np.isfinite(begins_us), begins_us, flown_us[hidden].min())
+    ends_us = np.where(np.isfinite(ends_us), ends_us, flown_us[hidden].max())
+    seconds, since_s = float((ends_us - begins_us).sum()) / 1e6, at_s(float(begins_us.min()))
     yield (
         f"the simulator's true states could not be recorded for {seconds:.1f} s, from {since_s:.1f} s on: "
         "separation and crashes can't be judged there"
