@@ -137,7 +137,7 @@ def test_a_long_way_back_is_flown_to_its_end() -> None:
     """A line of 5 min led 500 m away; after 2 min on the way back the flight was over, "did not finish"."""
     line = ("mission.kind=line", "mission.line.origin_ned_m=[0, 0, -1]", "mission.line.velocity_ned_m_s=[3, 0, 0]")
     slow = ("agent.state_machine.speed_m_s=0.2", "mission.duration_s=6", "start.center_ned_m=[0, 0, -1]")
-    lockstep = Lockstep(load(None, ("swarm.agents=1", "sitl.physics_hz=100", "agent.rate_hz=25", *line, *slow)))
+    lockstep = Lockstep(load(None, ("swarm.agents=1", "sitl.physics_hz=50", "agent.rate_hz=10", *line, *slow)))
     lockstep.run()
     assert lockstep.problems() == []
     assert lockstep.clock.now_us() > 150_000_000
