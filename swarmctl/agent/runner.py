@@ -157,9 +157,10 @@ def _fly(flight: RealTimeAgent, clock: WallClock, priority: FlightPriority) -> E
 
 
 def keep_from_collections() -> None:
-    """Keep objects of the start-up out of garbage collections during flight."""
+    """Keep objects of the start-up, during which the verb collects no garbage, out of collections during flight."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @contextmanager

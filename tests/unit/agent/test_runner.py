@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import signal
@@ -21,6 +22,7 @@ from swarmctl.agent.runner import (
     StopOrder,
     _check_vehicle_silence,
     _fly,
+    keep_from_collections,
     run_agent,
 )
 from swarmctl.bus.silence import SessionWatch
@@ -256,3 +258,12 @@ def test_a_step_of_the_hosts_utc_is_followed_slowly() -> None:
     assert began_us + 2_000_000 - before_us == pytest.approx(20_000, abs=10), "1 % of the time that has passed"
     elapsed_ns += 100_000_000_000
     assert clock.utc_us() == utc_ns() // 1000
+
+
+def test_garbage_is_collected_in_flight_though_not_while_modules_load() -> None:
+    gc.disable()  # as the verb does
+    try:
+        keep_from_collections()
+        assert gc.isenabled()
+    finally:
+        gc.enable()
