@@ -536,14 +536,14 @@ def test_a_host_that_kills_its_agents_tells_the_other_hosts_by_a_router_that_sti
 
 def test_a_launcher_that_did_not_run_calls_nobody_silent(tmp_path: Path) -> None:
     """On an overloaded machine agents have real-time priority, and the launcher waits; so does what it is sent."""
-    scene = ScriptedServices(tmp_path, [ends(0, 9.0), ends(0, 9.0)])
+    scene = ScriptedServices(tmp_path, [ends(0, 6.0), ends(0, 6.0)])
 
     def hear_nothing() -> None:
         scene.silent = {0, 1}
         scene.act = sleep
 
     def sleep() -> None:
-        time.sleep(6.0)
+        time.sleep(3.0)  # three times as long as an agent may be silent
         scene.act = scene.silent.clear
 
     scene.act = hear_nothing
