@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-SHORT = ("--agents", "1", "--duration", "1", "--no-view", "--set", "telemetry.enabled=false", "--set", "sitl.start=air")
+COARSE = ("--set", "sitl.start=air", "--set", "sitl.physics_hz=100", "--set", "agent.rate_hz=25")
+SHORT = ("--agents", "1", "--duration", "1", "--no-view", "--set", "telemetry.enabled=false", *COARSE)
 
 
 def test_what_the_encoding_lacks_is_printed_as_escapes(tmp_path: Path) -> None:
@@ -38,7 +39,7 @@ def test_closed_streams_change_neither_exit_code_nor_files(tmp_path: Path) -> No
 
 def test_a_reader_that_closes_the_pipe_ends_no_verb(tmp_path: Path) -> None:
     """`| head` ended a sweep before its first flight in a traceback, and measurements without a file."""
-    short = ("--set", "swarm.agents=1", "--set", "sitl.start=air", "--duration", "1", "--jobs", "1")
+    short = ("--set", "swarm.agents=1", *COARSE, "--duration", "1", "--jobs", "1")
     sweep = ("sweep", "--set", "mission.circle.radius_m=2,3", *short, "--out", str(tmp_path))
     for arguments, unbuffered in ((sweep, ""), (("config", "show"), ""), (("config", "show"), "1")):
         command = ["bash", "-c", '"$0" -m swarmctl "$@" | head -0; exit ${PIPESTATUS[0]}', sys.executable, *arguments]

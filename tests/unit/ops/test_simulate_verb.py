@@ -17,7 +17,8 @@ from swarmctl.errors import StartError
 from swarmctl.telemetry.evaluation.referee import Rules
 from swarmctl.telemetry.recording.run_folder import report_run
 
-SHORT = ("--agents", "1", "--duration", "2", "--set", "telemetry.enabled=false", "--set", "sitl.start=air")
+COARSE = ("--set", "sitl.physics_hz=100", "--set", "agent.rate_hz=25")  # nothing here depends on the rates
+SHORT = ("--agents", "1", "--duration", "2", "--set", "telemetry.enabled=false", "--set", "sitl.start=air", *COARSE)
 
 
 def test_a_full_disk_costs_the_files_and_not_the_verdict(tmp_path: Path) -> None:
@@ -42,7 +43,17 @@ def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:
     """The kernel and the shell both send SIGHUP: the second one is no second request."""
     folder = tmp_path / "run"
     master, terminal = pty.openpty()
-    command = [sys.executable, "-m", "sitl.simulate", *SHORT[:2], "--duration", "600", "--run-dir", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "sitl.simulate",
+        *SHORT[:2],
+        *COARSE,
+        "--duration",
+        "600",
+        "--run-dir",
+        str(folder),
+    ]
     process = subprocess.Popen(command, stdin=terminal, stdout=terminal, stderr=terminal, start_new_session=True)
     os.close(terminal)
     until_s = time.monotonic() + 60.0
@@ -59,7 +70,17 @@ def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:
 
 def test_a_simulation_that_flies_is_not_finished_by_a_report(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    command = [sys.executable, "-m", "sitl.simulate", *SHORT[:2], "--duration", "600", "--run-dir", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "sitl.simulate",
+        *SHORT[:2],
+        *COARSE,
+        "--duration",
+        "600",
+        "--run-dir",
+        str(folder),
+    ]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     until_s = time.monotonic() + 60.0
     while not (folder / "agent-0.tlog").exists() and time.monotonic() < until_s:
