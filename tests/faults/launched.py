@@ -74,7 +74,7 @@ class Bounded(Launched):
 
 
 Start = Callable[..., Bounded]
-Script = Callable[[Start], None]
+Script = Callable[[Start], object]
 
 
 @dataclass(frozen=True, kw_only=True)
