@@ -8,8 +8,9 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from swarmctl.core.recorded.records import TRUTH_COLUMNS
 from swarmctl.ops.cli import main
 from swarmctl.telemetry.recording.file_names import PACKED_TRUTH
 from swarmctl.telemetry.recording.run_files import read_parquet
+from tests.benches.at_once import at_once
 from tests.benches.free_ports import free_ports
 from tests.benches.launches import READY_S, Launched
 from tests.process.test_bus import until
@@ -60,6 +62,9 @@ agents = [1]
 """
 
 
+Flight = Callable[[Path], None]
+Write = Callable[[Path, Sequence[int]], Path]
+OVER_SOON_S, LONG_S = 2.0, 600.0
 AGENTS = {"alpha": "0", "bravo": "1"}
 
 
@@ -71,9 +76,17 @@ class StartedStation(Launched):
     starts = "station"
 
 
-def write_swarm(folder: Path, duration_s: float = 12.0) -> Path:
+def write_swarm(folder: Path, ports: Sequence[int], duration_s: float = 12.0) -> Path:
     path = folder / "swarm.toml"
-    path.write_text(SWARM.format(ports=free_ports(2), duration_s=duration_s))
+    path.write_text(SWARM.format(ports=ports, duration_s=duration_s))
+    return path
+
+
+def write_one_host(folder: Path, ports: Sequence[int], duration_s: float) -> Path:
+    """Write a swarm whose agents both fly from alpha."""
+    path = write_swarm(folder, ports, duration_s)
+    of_one_host, _, _ = path.read_text().replace("agents = [0]", "agents = [0, 1]").rpartition("[[hosts]]")
+    path.write_text(of_one_host)
     return path
 
 
@@ -131,7 +144,7 @@ def test_two_hosts_fly_one_swarm_that_a_station_commands_and_judges(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One host comes late: the other says for whom it waits, and tells it of an obstacle that an operator has added."""
-    path = write_swarm(tmp_path, duration_s=600.0)
+    path = write_swarm(tmp_path, free_ports(2), LONG_S)
     make_keys(path, monkeypatch)
     with started(path) as start:
         alpha, station = start("alpha"), start("station")
@@ -166,9 +179,7 @@ def test_two_hosts_fly_one_swarm_that_a_station_commands_and_judges(
         assert [abs(clock["ahead_s"]) < 0.05 for clock in station.summary()["clocks"]] == [True, True], "one computer"
 
 
-def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_swarm(tmp_path)
-    make_keys(path, monkeypatch)
+def a_stop_of_one_host_lands_its_agents_alone(path: Path) -> None:
     with started(path) as start:
         alpha, bravo, station = start("alpha"), start("bravo"), start("station")
         alpha.until_phase("TRACK", 1)
@@ -183,12 +194,8 @@ def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: 
         assert least_separation_m(alpha.run_dir, bravo.run_dir) >= 0.85
 
 
-def test_who_has_landed_with_a_host_that_has_ended_does_not_fail_an_order_to_land_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def who_has_landed_with_a_host_that_has_ended_does_not_fail_an_order_to_land_all(path: Path) -> None:
     """Nobody repeats any more that it has landed, and the station has heard it."""
-    path = write_swarm(tmp_path, duration_s=600.0)
-    make_keys(path, monkeypatch)
     with started(path) as start:
         alpha, bravo, station = start("alpha"), start("bravo"), start("station")
         alpha.until_phase("TRACK", 1)
@@ -203,9 +210,7 @@ def test_who_has_landed_with_a_host_that_has_ended_does_not_fail_an_order_to_lan
         assert (alpha.end(), station.end()) == (130, 4), station.text()
 
 
-def test_a_station_ends_without_who_was_excluded_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_swarm(tmp_path, duration_s=6.0)
-    make_keys(path, monkeypatch)
+def a_station_ends_without_who_was_excluded_and_says_so(path: Path) -> None:
     with started(path) as start:
         alpha, station = start("alpha"), start("station")
         assert until(lambda: "waits for agent-1 to stand by" in alpha.text(), READY_S), alpha.text()
@@ -217,10 +222,8 @@ def test_a_station_ends_without_who_was_excluded_and_says_so(tmp_path: Path, mon
         assert (station.summary()["violations"], station.summary()["without"]) == ([], [1])
 
 
-def test_a_station_names_an_agent_that_died_on_the_ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def a_station_names_an_agent_that_died_on_the_ground(path: Path) -> None:
     """Its vehicle is taken over by a process that says only that an operator has stopped it."""
-    path = write_swarm(tmp_path)
-    make_keys(path, monkeypatch)
     with started(path) as start:
         bravo, station = start("bravo"), start("station")
         bravo.until_phase("STANDBY", 1)
@@ -233,12 +236,8 @@ def test_a_station_names_an_agent_that_died_on_the_ground(tmp_path: Path, monkey
         assert "had not ended: agent-0 (none)" in station.text()
 
 
-def test_a_station_that_comes_late_hears_who_has_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def a_station_that_comes_late_hears_who_has_died(path: Path) -> None:
     """Nothing else is heard of it any more, and its host is not over yet."""
-    path = write_swarm(tmp_path, duration_s=600.0)
-    of_one_host, _, _ = path.read_text().replace("agents = [0]", "agents = [0, 1]").rpartition("[[hosts]]")
-    path.write_text(of_one_host)
-    make_keys(path, monkeypatch)
     with started(path, {"alpha": "0,1"}) as start:
         alpha = start("alpha")
         alpha.until_phase("TRACK", 2)
@@ -251,3 +250,34 @@ def test_a_station_that_comes_late_hears_who_has_died(tmp_path: Path, monkeypatc
         assert alpha.end() == 4, alpha.text()
         assert station.end() == 4, station.text()
         assert "agent-1 died before its vehicle was down" in station.summary()["violations"]
+
+
+@pytest.mark.parametrize(
+    "flights",
+    [
+        (
+            (a_stop_of_one_host_lands_its_agents_alone, write_swarm),
+            (
+                who_has_landed_with_a_host_that_has_ended_does_not_fail_an_order_to_land_all,
+                partial(write_swarm, duration_s=LONG_S),
+            ),
+        ),
+        (
+            (a_station_ends_without_who_was_excluded_and_says_so, partial(write_swarm, duration_s=OVER_SOON_S)),
+            (a_station_names_an_agent_that_died_on_the_ground, write_swarm),
+            (a_station_that_comes_late_hears_who_has_died, partial(write_one_host, duration_s=LONG_S)),
+        ),
+    ],
+    ids=["a host ends", "an agent dies or never comes"],
+)
+def test_swarms_that_lose_a_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flights: Sequence[tuple[Flight, Write]]
+) -> None:
+    """Beside each other, each with ports and identities of its own."""
+    paths, ports = [], free_ports(2 * len(flights))  # all found at the same time, so that no two are the same
+    for number, (_, write) in enumerate(flights):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        paths.append(write(folder, ports[2 * number : 2 * number + 2]))
+        make_keys(paths[-1], monkeypatch)
+    at_once([partial(fly, path) for (fly, _), path in zip(flights, paths, strict=True)])
