@@ -63,6 +63,9 @@ class Flight:
             stdout=subprocess.PIPE,
             text=True,
         )
+
+    def get_under_way(self) -> None:
+        """Wait until the first turn can be flown."""
         self._answer()
 
     def turn_s(self) -> float:
@@ -90,6 +93,8 @@ def ratios(new: Path, old: Path, sets: tuple[str, ...], turns: int) -> list[floa
     try:
         flights += [Flight(new, sets)]
         flights += [Flight(old, sets)]
+        for flight in flights:
+            flight.get_under_way()
         found = []
         for turn in range(turns):
             first, second = flights if turn % 2 else flights[::-1]  # neither profits from what is warm

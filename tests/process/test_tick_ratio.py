@@ -48,5 +48,5 @@ def test_a_slower_tick_is_seen(
     monkeypatch.syspath_prepend(ROOT / "tools")
     from tick_ratio import FLIGHTS, LIMIT, ratios
 
-    found = ratios(copied(appended), ROOT, FLIGHTS["best effort"], turns=40)
+    found = ratios(copied(appended), ROOT, (*FLIGHTS["best effort"], "swarm.agents=2"), turns=40)
     assert (median(found) > LIMIT) == is_slower
