@@ -44,6 +44,8 @@ class Simulator:
         arguments += [
             "--ekf-ready-s",
             "0.2",
+            "--physics-hz",  # what is asked on the ground does not depend on it
+            "100",
             "--local-port",
             f"{free_ports(1)[0]}",
             "--die-with-parent",
