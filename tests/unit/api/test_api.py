@@ -26,6 +26,7 @@ from swarmctl.config import Config, dump, load
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
+from swarmctl.ops.orders import operator
 from swarmctl.ops.orders.order_delivery import Reply
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
 from tests import builders
@@ -173,7 +174,8 @@ def test_an_order_that_does_not_exist_or_comes_too_late_is_refused(tmp_path: Pat
         swarm.hold()
 
 
-def test_waiting_has_an_end(tmp_path: Path) -> None:
+def test_waiting_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(operator, "_CONNECT_MS", 100)  # for a router that is not there
     process = FlightProcess("launch", tmp_path, "tests.benches.until_interrupted")
     until_s = time.monotonic() + 20.0
     while "running" not in (tmp_path / "launch.log").read_text():
