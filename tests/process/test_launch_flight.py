@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+import swarmctl.ops.supervision.landing_order
 import swarmctl.ops.supervision.recovery
 import swarmctl.ops.supervision.supervisor
 from swarmctl.bus.bus import Bus, agent_name
@@ -114,7 +115,7 @@ def test_who_is_heard_landing_is_not_killed_on_its_way_down(
 ) -> None:
     """After Ctrl-C at a height of 90 m agents were killed before touchdown, and the flight had failed."""
     monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_LAND_S", 1.0)
-    monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_LANDING_S", landing_s, raising=False)
+    monkeypatch.setattr(swarmctl.ops.supervision.landing_order, "_LANDING_S", landing_s)
     services = ScriptedServices(tmp_path, [ends(EXIT_INTERRUPTED, 5.0)])
     services.phase, services.obeys = phase, False
     services.act = lambda: setattr(services, "interrupts", 1)

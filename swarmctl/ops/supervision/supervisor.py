@@ -26,6 +26,7 @@ from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill
 from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.ended_processes import EndedProcesses
 from swarmctl.ops.supervision.hearing import Hearing
+from swarmctl.ops.supervision.landing_order import LandingOrder, is_landing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.supervision.own_pause import OwnPause
@@ -48,8 +49,6 @@ _TIMED = (Phase.TRACK, Phase.GOTO_LAND)  # phases whose end is known
 _SILENCE_S = 5.0
 _STANDSTILL_S = 5.0  # of a silent agent, after which it is ended
 _LAND_S = 60.0  # for agents to land that are told to; later they are killed
-_LANDING_S = 300.0  # instead, for those that are heard landing: from 90 m it takes more than a minute
-_LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
 _ROUTER_STARTS = 3  # in one flight
 _TOLD_S = 0.3  # in which the router passes on what it was told last
@@ -117,9 +116,7 @@ class FlightSupervisor:
         self._essential_lost = False  # an essential process, router or simulator, has ended
         self._vehicles_lost = False  # the simulator has ended, and its vehicles with it
         self._recovery = Recovery(services.recover, config.sysids())
-        self._land_ordered_s: float | None = None
-        self._land_said_s = 0.0
-        self._land_until_s = 0.0
+        self._landing = LandingOrder()
 
     def fly(self, interrupts: Callable[[], int]) -> LaunchResult:
         """Watch the flight to its end.
@@ -309,17 +306,12 @@ class FlightSupervisor:
         self._obstacles.repeat()
         self._services.announce_clock()
         self._ended.repeat()
-        if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
-            self._land_said_s = now_s
-            self._repeat_land_order(now_s - self._land_ordered_s)
+        if self._landing.is_to_be_said(now_s):
+            self._repeat_land_order(self._landing.since_s(now_s))
 
     def _repeat_land_order(self, since_s: float) -> None:
         """Repeat the order on the bus, newly stamped, until every agent shows that it lands; later also by signal."""
-        deaf = [
-            view
-            for view in self._flying()
-            if view.status is None or view.status.phase < Phase.GOTO_LAND or view.status.held
-        ]
+        deaf = [view for view in self._flying() if not is_landing(view)]
         if deaf and len(self._views) == self._config.swarm.agents:
             self._order(Order("land"), deaf)
         elif deaf:  # agents of other computers fly on
@@ -336,7 +328,7 @@ class FlightSupervisor:
         running = self._running()
         if any(_end_of(child) not in self._reported for child in self._agents() if child.poll() is not None):
             return False  # it has ended since the agents were watched, and may say how the flight went
-        if self._land_ordered_s is not None and now_s > self._land_until_s:
+        if self._landing.is_overdue(now_s):
             self._end_late([v for v in running if not (self._is_recovered(v) or self._is_landing(v, now_s))])
             return not running
         if not running:
@@ -346,7 +338,7 @@ class FlightSupervisor:
                 if c.ended_s is not None and c.poll() not in (0, 130)
             ]
             return self._essential_lost or not deaths_s or now_s - max(deaths_s) > _AFTER_DEATH_S
-        if self._land_ordered_s is None and all(view.note == "silent" for view in running):
+        if not self._landing.is_given and all(view.note == "silent" for view in running):
             bus_is_suspect = len(running) == len(self._views) and len(running) > 1
             self._land(_LAND_S if bus_is_suspect else _AFTER_DEATH_S)
         return False
@@ -357,12 +349,7 @@ class FlightSupervisor:
         return self._recovery.is_on(agent) and not (self._vehicles_lost or self._recovery.is_overdue(agent))
 
     def _is_landing(self, view: AgentView, now_s: float) -> bool:
-        """Return whether an agent does what it was ordered to, and has the time that this takes."""
-        status = view.status
-        if status is None or status.held or view.note == "silent" or self._vehicles_lost:
-            return False
-        since_s = now_s - (self._land_ordered_s or now_s)
-        return Phase.GOTO_LAND <= status.phase < Phase.DONE and since_s <= _LANDING_S
+        return not self._vehicles_lost and self._landing.is_obeyed(view, now_s)
 
     def _end_late(self, running: list[AgentView]) -> None:
         """Kill who has not landed in time, and who is done and only waits for those."""
@@ -384,14 +371,14 @@ class FlightSupervisor:
         if code == EXIT_OK or self._essential_lost or self._recovery.is_on(view.agent):
             return
         if code == EXIT_INTERRUPTED:
-            self._result.landed_by_operator |= self._land_ordered_s is None
+            self._result.landed_by_operator |= not self._landing.is_given
         elif code == EXIT_START:
             self._refuse(f"{child.name} could not start: {child.last_line()}")
         elif code == EXIT_MISSION:
             outcome = view.status.outcome if view.status else ""
             self._fail("agent_failed", f"{child.name} failed: {why_it_failed(outcome, child.last_line())}")
         elif view.status is None:
-            if self._land_ordered_s is None or code != _ENDED_BY_SIGTERM:  # `_land` ends so who still loads its modules
+            if not self._landing.is_given or code != _ENDED_BY_SIGTERM:  # `_land` ends so who still loads its modules
                 self._refuse(f"{child.name} could not start: it {child.how_it_ended()}")
         else:
             view.note = "dead"
@@ -400,11 +387,8 @@ class FlightSupervisor:
 
     def _land(self, timeout_s: float) -> None:
         """Order all agents to land over the bus; by signal where the bus does not reach."""
-        now_s = time.monotonic()
-        if self._land_ordered_s is None:
-            self._land_ordered_s, self._land_until_s = now_s, now_s + timeout_s
+        if self._landing.give(time.monotonic(), timeout_s):
             self._services.log.write("land")
-        self._land_until_s = min(self._land_until_s, now_s + timeout_s)
         for view in self._flying():
             if self._essential_lost or view.status is None or view.note == "silent":
                 self._services.children[agent_name(view.agent)].signal(signal.SIGTERM)
