@@ -15,6 +15,8 @@ from swarmctl.core.text import counted, printable
 from swarmctl.errors import ConfigError
 
 _PLACES_SHOWN = 3
+_IN_OUR_WORDS = dict.fromkeys(("bool_type", "bool_parsing"), "write true or false")  # for those of pydantic
+_PATTERNS = {"^[A-Za-z0-9_-]{1,40}$": "allowed are 1 to 40 of the characters A-Z, a-z, 0-9, _ and -"}
 _PROBLEMS_SHOWN = 30
 _COMPONENTS = {"_ned": "north, east and down", "_ne_m": "north and east"}  # of vectors, by what their names hold
 _Model = TypeVar("_Model", bound=Params)
@@ -73,7 +75,9 @@ def _explain(error: dict[str, Any], root: type[Params], within: str, renamed: Ma
         return f"{key} = {value}: " + (f"one of a list; write [[{key}]]" if sections else "give a list in brackets")
     if error["type"] == OTHER_KEY:
         return f"{key} = {value}: {error['msg']}"
-    message = error["msg"]
+    if error["type"] == "model_type":
+        return f"{key} = {value}: is a section; set a key of it, such as {key}.{_keys_at(location, root)[0]}"
+    message = _IN_OUR_WORDS.get(error["type"]) or _PATTERNS.get(error.get("ctx", {}).get("pattern")) or error["msg"]
     return f"{key} = {value}: {message[:1].lower()}{message[1:]}{_range_of(location, root)}"
 
 
@@ -95,8 +99,8 @@ def _about_vector(error: Mapping[str, Any], location: Sequence[str], within: str
 
 
 def _hint(location: Sequence[str], root: type[Params], renamed: Mapping[str, str]) -> str:
-    """Suggest a correction for an unknown key: its new name, a key of its name elsewhere, a similar one here, or a
-    section of its name.
+    """Suggest a correction for an unknown key: its new name, the one here that it lacks the unit of, a key of its name
+    elsewhere, a similar one here, or a section of its name.
     """
     if now := renamed.get(".".join(location)):
         return f"did you mean {now!r}?"
@@ -104,8 +108,9 @@ def _hint(location: Sequence[str], root: type[Params], renamed: Mapping[str, str
     elsewhere = [key for key in keys if key.rpartition(".")[2] == location[-1]]
     sections = [key for key in elsewhere if any(other.startswith(f"{key}.") for other in keys)]
     known = _keys_at(location[:-1], root)
+    longer = [key for key in known if len(location) > 1 and key.startswith(f"{location[-1]}_")]
     close = difflib.get_close_matches(location[-1], known, 1)
-    if meant := [key for key in elsewhere if key not in sections] or close or sections:
+    if meant := longer or [key for key in elsewhere if key not in sections] or close or sections:
         return f"did you mean {' or '.join(map(repr, meant[:_PLACES_SHOWN]))}?"
     return f"known here: {', '.join(sorted(known))}"
 

@@ -70,7 +70,8 @@ def read_tree(path: Path | None) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(str(path), [f"can't be read: {error.strerror}. Give the path of a TOML file"]) from error
     except UnicodeDecodeError as error:
-        raise ConfigError(str(path), [f"can't be read: {error}"]) from error
+        problem = f"can't be read: no UTF-8 text, see byte {error.start}. Give the path of a TOML file"
+        raise ConfigError(str(path), [problem]) from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(str(path), [f"not TOML: {error}"]) from error
     except RecursionError as error:

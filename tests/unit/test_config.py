@@ -71,11 +71,16 @@ def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
         ("mission.waypoints.lists={times_s=[]}", ("one of a list; write [[mission.waypoints.lists]]",)),
         ("sitl.preset='mars'", ("sitl.preset = 'mars'", "thesis", "x500")),
         ("telemetry.port=0", ("telemetry.port = 0", ">= 1", "<= 65535")),
-        ("name='../../etc'", ("name = '../../etc'",)),
+        ("name='../../etc'", ("name = '../../etc': allowed are 1 to 40 of the characters A-Z, a-z, 0-9, _ and -",)),
         ("name=", ("name = ''",)),
         ("seed=-1", ("seed = -1", ">= 0")),
         ("seed=1\nname='x'", ("seed", "integer")),
-        ("swarm=3", ("swarm = 3",)),
+        ("swarm=3", ("swarm = 3: is a section; set a key of it, such as swarm.origin_lat_deg",)),
+        ("controller.mpc.z=3", ("is a section; set a key of it, such as controller.mpc.z.q_pos",)),
+        ("bus.relay=True", ("bus.relay = 'True': write true or false",)),
+        ("bus.relay=7", ("bus.relay = 7: write true or false",)),
+        ("mission.goto.speed=2", ("mission.goto.speed = 2: unknown key; did you mean 'speed_m_s'?",)),
+        ("swarm.origin=1", ("unknown key; did you mean 'origin_lat_deg' or 'origin_lon_deg' or 'origin_alt_m'?",)),
         (
             "agent.path_sharing={error_m=0.002,heartbeat_s=0.2}",
             ("agent.path_sharing.heartbeat_s = 0.2", "0.125", "separation.lost_after_s", "silent"),
@@ -136,7 +141,7 @@ def test_weights_that_are_left_out_are_those_of_their_axis(tmp_path: Path) -> No
     assert (mpc.z.q_pos, mpc.z.q_vel, mpc.z.r) == (3.0, 0.05, 1.0)
     assert (mpc.x.q_pos, mpc.x.q_vel, mpc.x.r) == (1.5, 0.5, 0.02)
     assert (follow_z.q_pos, follow_z.q_vel, follow_z.r) == (20.0, 0.6, 0.05)
-    assert "unknown key; known here: q_pos, q_vel, r" in refusals(path, "controller.mpc.z.q=1")[0]
+    assert "unknown key; known here: q_pos, q_vel, r" in refusals(path, "controller.mpc.z.s=1")[0]
 
 
 def test_agents_of_real_vehicles_share_no_process(tmp_path: Path) -> None:
@@ -440,7 +445,7 @@ def test_vehicles_beside_the_simulator_are_refused(tmp_path: Path) -> None:
     ("content", "word"),
     [
         (b"[swarm\nagents = 3", "not TOML"),
-        (b"\xff\xfe\x00", "can't be read"),
+        (b"\xff\xfe\x00", "can't be read: no UTF-8 text, see byte 0. Give the path of a TOML file"),
         (b"x = " + b"[" * 9000, "nested too deeply"),
     ],
 )
