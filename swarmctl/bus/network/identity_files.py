@@ -38,4 +38,5 @@ def identity_problems(folder: Path, name: str) -> Iterator[str]:
             read_file(folder / file, MOST_BYTES, private=private)
         except OSError as error:
             mode = ", a file of mode 0600" if private else ""
-            yield f"bus.identities: {folder / file}: {error.strerror}; copy it{mode} from where swarmctl keys init ran"
+            fix = f"copy it{mode} from the computer on which swarmctl keys init CONFIG has made it"
+            yield f"bus.identities: {folder / file}: {error.strerror}; {fix}"

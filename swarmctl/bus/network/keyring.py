@@ -140,7 +140,7 @@ def _judged(
     try:
         certificate = read_certificate(folder, name)
     except FileNotFoundError:
-        return f"{where}: missing; copy it from where swarmctl keys ran", None
+        return f"{where}: missing; copy it from the computer on which swarmctl keys has made it", None
     try:
         certificate.verify_directly_issued_by(authority)
     except (InvalidSignature, ValueError, TypeError):

@@ -38,15 +38,26 @@ def load_host(path: Path, agents: Sequence[int], overrides: Sequence[str] = ()) 
         ConfigError: the configuration is invalid, has no such host, or the host's identity can't be used.
     """
     config = load(path, overrides, only_agents=agents)
+    refuse_no_hosts(config)
     host = next((host for host in config.hosts if sorted(host.agents) == sorted(agents)), None)
     if host is None:
-        known = "; ".join(f"{host.name}: {','.join(map(str, host.agents))}" for host in config.hosts) or "none"
+        known = "; ".join(f"{host.name}: {','.join(map(str, host.agents))}" for host in config.hosts)
         raise ConfigError("--agents", [f"no host has just agents {list(agents)}; hosts of {path}: {known}"])
     if any(obstacle.moves for obstacle in config.obstacles):
         problem = "one moves, from a time at which every host starts it apart; add it in flight: swarmctl obstacle add"
         raise ConfigError("obstacles", [problem])
     refuse_unidentified(config, host.name)
     return config, host
+
+
+def refuse_no_hosts(config: Config) -> None:
+    """Check that a swarm has several computers.
+
+    Raises:
+        ConfigError: it has not.
+    """
+    if not config.hosts:
+        raise ConfigError("hosts", ["the configuration lists none; a swarm on one computer flies by: swarmctl launch"])
 
 
 def fly_host(config: Config, host: HostParams, options: LaunchOptions) -> int:

@@ -24,9 +24,8 @@ from swarmctl.control.phases.obeyed_orders import OPERATOR_STOP
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import unpack_tick
 from swarmctl.core.types import Phase
-from swarmctl.errors import ConfigError
 from swarmctl.flown_code import code_in_words
-from swarmctl.ops.flight.host import refuse_unidentified, shared_run_name
+from swarmctl.ops.flight.host import refuse_no_hosts, refuse_unidentified, shared_run_name
 from swarmctl.ops.flight.launch import LaunchOptions, SwarmPart, judged, started
 from swarmctl.ops.orders.operator import list_setters
 from swarmctl.ops.processes import ROUTER, VIEWER
@@ -55,8 +54,7 @@ def run_station(config: Config, options: LaunchOptions) -> int:
     Raises:
         ConfigError, StartError: it was refused, or did not come up.
     """
-    if not config.hosts:
-        raise ConfigError("hosts", ["the configuration lists none; a swarm on one computer flies by: swarmctl launch"])
+    refuse_no_hosts(config)
     refuse_unidentified(config, STATION)
     links = links_of(config.hosts, own_identity(config, STATION))
     part = SwarmPart(run=shared_run_name(config), agents=(), links=links)

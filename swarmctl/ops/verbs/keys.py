@@ -28,8 +28,10 @@ def keys_new(
     for path in files:
         try:
             print(f"{path}: key {write_new_key(path).fingerprint}")
+        except FileExistsError:
+            problems.append(f"{path}: exists already, and a vehicle may have that key; give another name")
         except OSError as error:
-            problems.append(f"{path}: {error.strerror}")
+            problems.append(f"{path}: can't be written: {error.strerror}")
     if problems:
         raise ConfigError("keys new", problems)
     return EXIT_OK

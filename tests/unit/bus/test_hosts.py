@@ -159,6 +159,8 @@ def test_a_host_flies_only_with_an_identity(path: Path) -> None:
     (folder / "bravo.key").chmod(0o644)
     with pytest.raises(ConfigError, match=r"bravo\.key"):
         load_host(path, [2, 3])
+    with pytest.raises(ConfigError, match="the configuration lists none; a swarm on one computer flies by: swarmctl l"):
+        load_host(CONFIG.with_name("px4_udp.toml"), [0])
     with pytest.raises(ConfigError, match=r"no host has just agents \[2\]; hosts of .*bravo: 2,3"):
         load_host(path, [2])
     with pytest.raises(ConfigError, match=r"bus\.identities: not set"):

@@ -43,8 +43,8 @@ def test_new_keys_are_named_by_their_fingerprints_alone(
     assert all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in files)
     assert run("keys", "new", str(files[0]), str(tmp_path / "2.key"), str(tmp_path / "no" / "folder")) == 2
     refused = capsys.readouterr().err
-    assert "0.key: File exists" in refused
-    assert "folder: No such file" in refused, "all at once"
+    assert "0.key: exists already, and a vehicle may have that key; give another name" in refused
+    assert "folder: can't be written: No such file" in refused, "all at once"
     assert read_key(files[0]).secret == keys[0].secret
     assert (tmp_path / "2.key").exists()
 
