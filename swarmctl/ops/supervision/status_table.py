@@ -303,6 +303,6 @@ def _number(value: float, digits: int, width: int) -> str:
 
 
 def _fits(value: float, digits: int, width: int) -> str:
-    """Format a number with as many digits as fit into `width` characters, never with a cut one."""
-    texts = (f"{value:.{places}f}" for places in range(digits, -1, -1))
+    """Format a number with as many digits as fit into `width` characters, never with a cut one, nor as -0."""
+    texts = (f"{value:z.{places}f}" for places in range(digits, -1, -1))
     return next((text for text in texts if len(text) <= width), f"{value:.0e}")

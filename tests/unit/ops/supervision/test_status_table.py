@@ -108,6 +108,11 @@ def test_what_is_unknown_is_a_dash_and_an_agent_without_a_status_has_its_number(
     assert status_cells(AgentView(agent=11))[0] == "11"
 
 
+def test_a_vehicle_at_the_height_of_the_origin_is_at_no_negative_one() -> None:
+    cells = status_cells(AgentView(agent=0, status=status(0, altitude_m=-1e-8)))
+    assert cells[5] == "0.0"
+
+
 def test_an_agent_that_is_silent_is_lost_and_its_link_ages() -> None:
     view = AgentView(agent=0, status=status(0, link_age_ms=100.0), received_s=time.monotonic() - 7.0)
     assert view.control == "LOST"
