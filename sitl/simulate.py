@@ -20,7 +20,7 @@ from rich.progress import Progress
 from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
 from swarmctl.configuration.config_warnings import warning_lines
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, SwarmError, exit_code_of
 from swarmctl.files import replace_bytes, write_each
 from swarmctl.ops.flight.summary import draw_recording, summary_lines, unwritten_line, violation_lines
 from swarmctl.ops.supervision.status_table import PlainLines
@@ -148,8 +148,16 @@ def _run(options: dict[str, Any]) -> int:
     directory = create_run_folder(options["run_dir"], config.name, utc_us())
     code = simulate(config, directory)
     if options["view"]:
-        open_viewer(str(directory / RECORDING))
+        _open(directory / RECORDING)
     return code
+
+
+def _open(recording: Path) -> None:
+    """Open a window on a recording; where none can be opened, say so: the flight keeps its exit code."""
+    try:
+        open_viewer(str(recording))
+    except SwarmError as error:
+        print(error, file=sys.stderr)
 
 
 if __name__ == "__main__":

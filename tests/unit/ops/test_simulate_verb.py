@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+import sitl.simulate as verb
 from swarmctl.errors import StartError
 from swarmctl.telemetry.evaluation.referee import Rules
 from swarmctl.telemetry.recording.run_folder import report_run
@@ -37,6 +38,17 @@ def test_a_full_disk_costs_the_files_and_not_the_verdict(tmp_path: Path) -> None
     report_run(tmp_path / "run", Rules(agents=1, required_separation_m=0.5))
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (summary["outcome"], summary["mode"]) == ("failed", "lockstep")
+
+
+def test_a_window_that_can_not_be_opened_changes_no_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    for code in (0, 4):
+        monkeypatch.setattr(verb, "simulate", lambda config, directory, code=code: code)
+        assert verb.main(["--view", "--run-dir", str(tmp_path / f"run-{code}")]) == code
+        assert f"rerun --port auto {tmp_path}/run-{code}/telemetry.rrd" in capsys.readouterr().err
 
 
 def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:
