@@ -194,4 +194,5 @@ def write_new(texts: Mapping[Path, str]) -> None:
             with path.open("x", encoding="utf-8") as file:
                 file.write(text)
         except OSError as error:
-            raise StartError(f"{path}: can't be written: {error.strerror}") from error
+            advice = "Give another name, or make its folder"
+            raise StartError(f"{path}: can't be written: {error.strerror}. {advice}") from error

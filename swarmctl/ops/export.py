@@ -44,5 +44,6 @@ def export_mcap(directory: Path, output: Path | None) -> Path:
         with StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1):  # leaves nothing of a file that is not finished
             write_mcap(path, recorded)
     except OSError as error:
-        raise StartError(f"{path}: can't be written: {error.strerror or error}") from error
+        problem = f"{path}: can't be written: {error.strerror or error}. Choose another with --output"
+        raise StartError(problem) from error
     return path

@@ -169,7 +169,7 @@ def run(options: argparse.Namespace) -> int:
     """Measure what the command line asks for, show and write it; return the exit code.
 
     Raises:
-        ConfigError: the folder can't be written to; nothing is measured then.
+        StartError: the folder can't be written to; nothing is measured then.
     """
     make_folder(options.out)
     console = Console()

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
-from swarmctl.errors import ConfigError
+from swarmctl.errors import StartError
 from swarmctl.files import replace_text
 
 
@@ -22,26 +22,30 @@ def make_folder(directory: Path) -> None:
     """Make the folder if necessary, and check that it takes a file, before minutes of measuring for it.
 
     Raises:
-        ConfigError: it can't be made or written to.
+        StartError: it can't be made or written to.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=directory):
             pass
     except OSError as error:
-        raise ConfigError("--out", [f"{directory}: can't be written: {error.strerror}"]) from error
+        raise _unwritable(directory, error) from error
 
 
 def write_texts(texts: Mapping[str, str], directory: Path) -> list[Path]:
     """Write files by name to `directory`, which is made if necessary, and return their paths.
 
     Raises:
-        ConfigError: one can't be written.
+        StartError: one can't be written.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
             replace_text(directory / name, text)
     except OSError as error:
-        raise ConfigError("--out", [f"{directory}: can't be written: {error.strerror}"]) from error
+        raise _unwritable(directory, error) from error
     return [directory / name for name in texts]
+
+
+def _unwritable(directory: Path, error: OSError) -> StartError:
+    return StartError(f"{directory}: can't be written: {error.strerror}. Choose another with --out")

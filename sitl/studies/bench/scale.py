@@ -234,7 +234,7 @@ def write(rows: Sequence[ScaleRow], directory: Path) -> list[Path]:
     """Write `scale.json` and `scale.html` to `directory`, which is made if necessary, and return their paths.
 
     Raises:
-        ConfigError: it can't be written.
+        StartError: it can't be written.
     """
     page = render(__package__, "scale.html", rows=rows, charts=[_chart(growth) for growth in growths(rows)])
     return write_texts({"scale.json": json_rows(rows), "scale.html": page}, directory)

@@ -262,7 +262,8 @@ def write_file(path: Path, known: ObstaclesMessage) -> None:
     """Write the obstacles as they are now to a new file, which `read_file` and configurations take.
 
     Raises:
-        ConfigError: the file exists already, or can't be written.
+        ConfigError: the file exists already.
+        StartError: it can't be written.
     """
     listed = [_shown(item, known.utc_us) for item in known.obstacles]
     tables = [{key: value for key, value in item.items() if key != "number"} for item in listed]

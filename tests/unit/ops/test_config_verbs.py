@@ -124,7 +124,7 @@ def test_a_built_in_file_is_written_with_its_comments_and_overwrites_nothing(tmp
     with pytest.raises(ConfigError, match="exists already"):
         write_new({tmp_path / "other.toml": "", path: ""})
     assert not (tmp_path / "other.toml").exists(), "all or none"
-    with pytest.raises(StartError, match="can't be written"):
+    with pytest.raises(StartError, match=r"can't be written: No such.*\. Give another name, or make its folder"):
         write_new({tmp_path / "no" / "where.toml": ""})
     with pytest.raises(ConfigError, match=r"known are .*figure_8, .*own_pid, .*x500_circle"):
         config_help.initial_files("x501")

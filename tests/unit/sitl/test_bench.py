@@ -21,7 +21,7 @@ from swarmctl.agent.mission import start_conditions
 from swarmctl.control.estimation import accuracy
 from swarmctl.control.failsafe.overload import Readiness
 from swarmctl.core.types import Array, PlanStatus
-from swarmctl.errors import ConfigError, MissionError
+from swarmctl.errors import MissionError, StartError
 
 SPEED_M_S = formation.RADIUS_M * formation.OMEGA_RAD_S
 
@@ -108,7 +108,7 @@ def test_without_daqp_the_problems_are_timed_with_osqp(captured: Captured, monke
 
 def test_a_folder_that_cannot_be_made_is_an_error_in_words(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="--out"):
+    with pytest.raises(StartError, match="--out"):
         bench.write([], tmp_path / "file")
 
 
@@ -336,11 +336,11 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(
 ) -> None:
     monkeypatch.setattr(bench, "bench", lambda *_, **__: pytest.fail("measured"))
     (tmp_path / "file").touch()
-    assert command.main(["--out", str(tmp_path / "file" / "folder")]) == 2
-    assert "can't be written" in capsys.readouterr().err
+    assert command.main(["--out", str(tmp_path / "file" / "folder")]) == 3
+    assert "can't be written: Not a directory. Choose another with --out" in capsys.readouterr().err
 
 
 def test_growth_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="can't be written"):
+    with pytest.raises(StartError, match="can't be written"):
         scale.write([], tmp_path / "file")

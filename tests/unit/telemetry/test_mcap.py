@@ -304,5 +304,5 @@ def test_without_the_library_it_is_said_how_to_install_it(folder: Path, monkeypa
 def test_a_folder_without_a_run_and_a_file_that_can_not_be_written_are_named(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError):
         export_mcap(tmp_path, None)
-    with pytest.raises(StartError, match="can't be written"):
+    with pytest.raises(StartError, match=r"can't be written: .*\. Choose another with --output"):
         export_mcap(folder, tmp_path / "nowhere" / "run.mcap")
