@@ -29,7 +29,8 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="swarmctl reproduce", description=_WHAT)
     add = parser.add_argument
-    add("--only", action="append", default=[], metavar="FLIGHT", help="one experiment; repeatable")
+    which = "one experiment, such as pid_fast; repeatable; an unknown one lists all"
+    add("--only", action="append", default=[], metavar="FLIGHT", help=which)
     add("--plant", action="store_true", help="fly the model only, as the thesis did")
     add("--full", action="store_true", help="fly the full MAVLink loop only")
     add("--out", type=Path, metavar="DIR", help="folder to write; default runs/<UTC>-reproduce")
