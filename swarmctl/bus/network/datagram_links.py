@@ -10,6 +10,7 @@ The socket is at the port after that of the router's own address; the station, w
 from __future__ import annotations
 
 import contextlib
+import errno
 import ipaddress
 import secrets
 import socket
@@ -216,10 +217,13 @@ def bind_datagrams(identity: OwnIdentity) -> socket.socket:
     except OSError as error:
         sock.close()
         where = " port ".join(map(str, own or ()))
-        raise StartError(
-            f"datagrams at {where}: {error.strerror}. It is the port after that of the host's address in [[hosts]]; "
-            "use another address, or end what uses the port"
-        ) from error
+        if error.errno == errno.EADDRNOTAVAIL:
+            fix = f"This computer has no such address; correct that of {identity.name} in [[hosts]], on every computer"
+        else:
+            fix = (
+                "It is the port after that of the host's address in [[hosts]]; use another address, or end what uses it"
+            )
+        raise StartError(f"datagrams at {where}: {error.strerror}. {fix}") from error
     sock.settimeout(_WAKE_S)
     return sock
 

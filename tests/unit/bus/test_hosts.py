@@ -12,11 +12,12 @@ import pytest
 from cryptography.x509 import load_pem_x509_crl
 
 from swarmctl.bus.network import identities
+from swarmctl.bus.network.datagram_links import bind_datagrams
 from swarmctl.bus.network.hosts import HostParams, host_problems, links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.keyring import load_keyring
 from swarmctl.config import load, own_identity
-from swarmctl.errors import ConfigError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import create_private
 from swarmctl.ops.cli import main
 from swarmctl.ops.flight.host import (
@@ -77,6 +78,12 @@ def test_more_hosts_than_datagrams_can_tell_of_are_refused() -> None:
     hosts = [HostParams(name=f"h{i}", address=f"10.0.0.{i + 1}:7448", agents=(i,)) for i in range(64)]
     assert not list(host_problems(hosts[:63], 63))
     assert any("largest allowed: 63" in problem for problem in host_problems(hosts, 64))
+
+
+def test_an_address_of_another_computer_is_named() -> None:
+    config = load(CONFIG, [ALPHA + "address='192.0.2.1:7448'"])  # of documentation: of no computer
+    with pytest.raises(StartError, match=r"192\.0\.2\.1 port 7449: .*no such address; correct that of alpha in \[\[h"):
+        bind_datagrams(own_identity(config, "alpha"))
 
 
 def with_devices(*devices: str) -> list[str]:
