@@ -94,14 +94,14 @@ FaultKind = Literal[
 class FaultParams(Params):
     """Describes one injected fault, on one vehicle or on all."""
 
-    kind: FaultKind
+    kind: FaultKind  # what fails, see Kinds of faults
     at_s: float = Field(0.0, ge=0, le=86400)  # after the simulator's start
     vehicle: int = Field(EVERY_VEHICLE, ge=EVERY_VEHICLE, le=99)  # -1: all
-    value: float | None = None  # size, in the unit of the kind; see FAULTS
-    for_s: float = Field(0.0, ge=0, le=86400)  # 0: to the end
-    rotor: int = Field(0, ge=0, le=3)  # motor
-    direction: Literal["both", "to_vehicle", "from_vehicle"] = "both"  # link_*
-    towards_deg: float = Field(0.0, ge=-360, le=360)  # gust, wind, estimator_jump: clockwise from north
+    value: float | None = None  # size, in the unit of the kind, see Kinds of faults
+    for_s: float = Field(0.0, ge=0, le=86400)  # duration; 0: to the end
+    rotor: int = Field(0, ge=0, le=3)  # the one that a fault of kind motor is of
+    direction: Literal["both", "to_vehicle", "from_vehicle"] = "both"  # of links, for the kinds link_*
+    towards_deg: float = Field(0.0, ge=-360, le=360)  # of gust, wind and estimator_jump, clockwise from north
 
     @property
     def amount(self) -> float:
@@ -132,7 +132,7 @@ class SimulatorParams(Params):
     battery: BatteryParams = BatteryParams()
     faults: tuple[FaultParams, ...] = Field((), strict=False)
     thrust_curve_01: float = Field(0.0, ge=0, le=1)  # k in force = (1 - k) u + k u^2 of a rotor's command u; 0 linear
-    motor_tau_s: float | None = Field(None, ge=0, le=0.5)  # lag of the rotors; None: that of the airframe
+    motor_tau_s: float | None = Field(None, ge=0, le=0.5)  # lag of the rotors; left out: that of the airframe
     drag_scale: float = Field(1.0, ge=0, le=10)  # factor on the airframe's drag; 0: none
     ground_effect: bool = False  # more thrust close to the ground
     preset: Literal["thesis", "x500", "crazyflie", "arducopter"] = "thesis"  # airframe

@@ -49,8 +49,8 @@ class MavlinkParams(Params):
 class SitlParams(SimulatorParams):
     """The built-in simulator that launch starts; disabled to fly other vehicles."""
 
-    enabled: bool = True
-    link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only
+    enabled: bool = True  # false: fly the vehicles listed in [[vehicles]]
+    link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only, of MAVLink frames in each direction
 
 
 class BusParams(Params):
@@ -59,8 +59,8 @@ class BusParams(Params):
     identities: str = ""  # folder written by swarmctl keys init; needed by swarmctl host and station only
     relay: bool = False  # hosts pass on what others say; else each is heard on its own links alone
     lease_ms: int = Field(DEFAULT_LEASE_MS, ge=500, le=10000)  # silence after which a link is closed
-    delay_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, on top of one tick
-    loss_01: float = Field(0.0, ge=0, le=1)  # lockstep only
+    delay_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, of each message, on top of one tick
+    loss_01: float = Field(0.0, ge=0, le=1)  # lockstep only, fraction of messages that are lost
     burst_01: float = Field(0.0, ge=0, le=0.99)  # lockstep only, fraction of time in which a link loses everything
     burst_s: float = Field(2.0, ge=0.01, le=600)  # lockstep only, mean length of such a bad period
     jitter_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, largest extra delay; messages overtake each other
@@ -69,7 +69,7 @@ class BusParams(Params):
 class TelemetryParams(Params):
     """Parameters of the viewer, the one process that uses rerun."""
 
-    enabled: bool = True
+    enabled: bool = True  # false: no view, and no telemetry.rrd of a launch
     port: int = Field(9877, ge=1, le=65535)  # loopback, not the default of rerun; the next free one if taken
     rate_hz: float = Field(10.0, gt=0, le=50)  # updates of the view per agent
     history_mb: int = Field(32, ge=1, le=65536)  # for who opens the view late: three agents fill 20 MB a minute

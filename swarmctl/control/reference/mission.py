@@ -39,7 +39,7 @@ else:
 class MissionParams(Params):
     """Sets what is flown between start and landing."""
 
-    kind: MissionName = "circle"
+    kind: MissionName = "circle"  # its parameters are in the section of that name
     duration_s: float = Field(37.7, gt=0, le=36000)  # tracked time, without transits; overridden by --duration
     yaw_rad: float = Field(0.0, ge=-3.1416, le=3.1416)  # heading of every vehicle, clockwise from north
     own: dict[str, Any] = Field({})  # parameters of an own kind
