@@ -10,6 +10,7 @@ from typing import Any
 from swarmctl.config import NO_VALUES, Config
 from swarmctl.config import load as load_config
 from swarmctl.configuration.config_warnings import config_warnings
+from swarmctl.errors import ConfigError
 
 __all__ = ["Config", "load"]
 
@@ -28,6 +29,8 @@ def load(
     Raises:
         ConfigError: it is invalid; lists all problems with key, value, allowed range and fix.
     """
+    if not isinstance(set, Mapping):
+        raise ConfigError("set", [f"{set!r}: give values by dotted key, as {{'swarm.agents': 5}}"])
     values = {key: _plain(value) for key, value in set.items()}
     config = load_config(None if path is None else Path(path), values=values)
     for text in config_warnings(config):

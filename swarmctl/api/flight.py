@@ -83,6 +83,8 @@ def launch(config: Config | None = None, folder: str | Path | None = None, *, vi
 
 def _new_folder(config: Config, folder: str | Path | None) -> Path:
     """Return a new run folder that holds the configuration."""
+    if not isinstance(config, Config):
+        raise ConfigError("config", [f"{config!r}: give what swarmctl.load returns, as swarmctl.load({config!r})"])
     directory = create_run_folder(None if folder is None else Path(folder), config.name, utc_us())
     write_config(directory, dump(config))
     return directory.resolve()

@@ -80,7 +80,7 @@ class Run:
             KeyError: the agent has recorded nothing.
         """
         if agent not in self._data.ticks:
-            raise KeyError(f"agent {agent} has recorded no ticks; those that have: {list(self.agents)}")
+            raise KeyError(f"agent {agent!r} has recorded no ticks; those that have: {list(self.agents)}")
         return self._data.ticks[agent]
 
     def plans(self, agent: int) -> pa.Table:

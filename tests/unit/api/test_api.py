@@ -97,6 +97,19 @@ def test_values_are_set_as_python_has_them() -> None:
         swarmctl.load("nowhere.toml")
 
 
+@pytest.mark.parametrize("wrong", [["swarm.agents=5"], "swarm.agents=5"])
+def test_values_that_have_no_keys_are_refused_in_words(wrong: Any) -> None:
+    with pytest.raises(ConfigError, match=r"give values by dotted key, as \{'swarm\.agents': 5\}"):
+        swarmctl.load(set=wrong)
+
+
+@pytest.mark.parametrize("fly", [swarmctl.simulate, swarmctl.launch])
+def test_a_file_in_the_place_of_a_configuration_is_refused_in_words(fly: Any, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"give what swarmctl\.load returns, as swarmctl\.load\('swarm\.toml'\)"):
+        fly("swarm.toml", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_run_has_names_and_units(finished_run: Path) -> None:
     run = swarmctl.load_run(str(finished_run))
     assert (run.agents, run.outcome, run.violations) == ((0, 1, 2), "completed", [])
