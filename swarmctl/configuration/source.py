@@ -117,7 +117,8 @@ def _place(tree: dict[str, Any], parts: list[str], value: Any) -> str:
         if isinstance(node, list):
             at = _index(part, len(node))
             if at is None:
-                return f"{shown(part)} is not an index of a list of {len(node)}"
+                whole = "set the whole list, key=[...], or write it in the file"
+                return f"{shown(part)} is not an index of a list of {len(node)}" + ("" if node else f"; {whole}")
             node = node[at]
         elif isinstance(node, dict):
             node = node.setdefault(part, [] if following.isdecimal() else {})

@@ -101,7 +101,10 @@ def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
         ("sitl.enabled=false", ("vehicles", "sitl.enabled = false", "[[vehicles]]")),
         ("swarm.agents", ("write it as key.sub=value",)),
         ("swarm..agents=3", ("write it as key.sub=value",)),
-        ("vehicles.0.url='x'", ("'0' is not an index",)),
+        (
+            "vehicles.0.url='x'",
+            ("'0' is not an index of a list of 0; set the whole list, key=[...], or write it in the file",),
+        ),
         ("seed.x=1", ("no such place",)),
         ("agents=5", ("agents = 5", "unknown key", "'swarm.agents'")),
         ("swarm.preset='x500'", ("unknown key", "'sitl.preset'")),
