@@ -12,7 +12,7 @@ from swarmctl.agent.sharing.interest import Interest
 from swarmctl.bus import topics
 from swarmctl.bus.bus import agent_name
 from swarmctl.control.commit.reach import FarPeers
-from tests.closed_loop.conftest import COARSE, Flight, fly_now, mission_t_s
+from tests.closed_loop.conftest import COARSE, Flight, closer_than, fly_now, mission_t_s
 from tests.closed_loop.test_interest import to_goals
 
 COMMITTED_M = 0.85
@@ -32,12 +32,12 @@ def by_commitments_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Interest, "_reaches", lambda *_, **__: False)
 
 
-def head_on(*more: str, too_close_m: float = 0.0) -> Flight:
+def head_on(*more: str, off_m: float = 0.1, too_close_m: float = 0.0) -> Flight:
     """Fly two agents towards each other, each to the start of the other one, from where neither reaches the other.
 
-    The flight ends when they are too close.
+    The flight ends so near to their goals, or when they are too close.
     """
-    return to_goals(_STARTS, _STARTS[::-1], *FAR, *more, too_close_m=too_close_m)
+    return to_goals(_STARTS, _STARTS[::-1], *FAR, *more, off_m=off_m, shown=closer_than(too_close_m))
 
 
 def sent(flight: Flight) -> dict[str, int]:
@@ -48,7 +48,7 @@ def sent(flight: Flight) -> dict[str, int]:
 
 @pytest.mark.usefixtures("by_commitments_alone")
 def test_two_that_come_from_far_acknowledge_each_other_before_they_can_meet() -> None:
-    flight = head_on()
+    flight = head_on(off_m=11.0)  # 3 m past each other
     assert flight.separation_m() >= COMMITTED_M
 
 
@@ -84,13 +84,19 @@ def test_faster_proposals_take_the_acknowledgements_of_all() -> None:
     assert flight.separation_m() >= COMMITTED_M
 
 
-def in_the_dark() -> Flight:
-    """Let the bus fail for 14 s, 6 s after both have begun to fly towards each other; they would meet 9 s later."""
+def in_the_dark(too_close_m: float = 0.0) -> Flight:
+    """Let the bus fail for 14 s, 6 s after both have begun to fly towards each other; they would meet 9 s later.
+
+    The flight ends when they are too close, if a distance for that is given.
+    """
+    fails = {6.0: lambda lockstep: lockstep.hub.fail()}
+    recovers = {} if too_close_m else {20.0: lambda lockstep: lockstep.hub.recover()}
+    too_close = closer_than(too_close_m)
     return fly_now(
         *("sitl.start=air", "swarm.agents=2", f"start.positions_ned_m={json.dumps(_FARTHER)}", *FAR),
         *("mission.kind=goto", f"mission.goto.goals_ned_m={json.dumps(_FARTHER[::-1])}", "mission.duration_s=40"),
-        at={6.0: lambda lockstep: lockstep.hub.fail(), 20.0: lambda lockstep: lockstep.hub.recover()},
-        until=lambda lockstep: mission_t_s(lockstep) > 24.0,
+        at=fails | recovers,
+        until=lambda lockstep: mission_t_s(lockstep) > 24.0 or too_close(lockstep),
     )
 
 
@@ -108,7 +114,7 @@ def test_without_a_bus_even_those_that_are_far_stop() -> None:
 @pytest.mark.usefixtures("by_commitments_alone")
 def test_negative_control_without_the_lease_they_fly_into_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FarPeers, "_is_leased", lambda self, agent, *_: agent not in self.near)
-    assert in_the_dark().separation_m() < 0.5
+    assert in_the_dark(0.5).separation_m() < 0.5
 
 
 def gone_on_m() -> float:
