@@ -16,9 +16,8 @@ from pymavlink.dialects.v20 import development as mavlink
 from sitl.lockstep import Lockstep
 from swarmctl.agent.sharing import path_publisher
 from swarmctl.control.estimation import flown_by_others
-from swarmctl.core.types import Phase
 from swarmctl.mavlink.codec import Codec
-from tests.closed_loop.conftest import COARSE, Fly, mission_t_s
+from tests.closed_loop.conftest import COARSE, Fly, closer_than, mission_t_s
 from tests.closed_loop.test_failures import PASSING
 
 STARTS_NED_M = [[0.0, 0.0, -5.0], [0.0, 1.1, -5.0], [0.0, -1.1, -5.0], [6.0, 0.05, -5.0]]
@@ -64,24 +63,31 @@ def move(
     say(running, mavlink.MAVLink_command_int_message(MOVED + 1, 1, frame, command, 0, 0, *params))
 
 
-def others_are_done(running: Lockstep) -> bool:
-    """Return whether no other is in the mission any more: who was moved stays in hold, and nobody lands it."""
-    return all(len(log.rows) and log.rows[-1]["phase"][0] > Phase.TRACK for log in running.logs[:MOVED])
+PASSED_M = -4.0  # north of who was moved
+
+
+def has_passed(running: Lockstep) -> bool:
+    return bool(running.world.truth_rows()["pos_ned_m"][MOVED, 0] < PASSED_M)
 
 
 @pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
 def test_others_keep_away_from_who_is_moved_in_hold(fly: Fly, mode: str) -> None:
-    flight = fly(*SCENE, f"separation.mode={mode}", at={TAKEN_S: take, MOVED_S: move}, until=others_are_done)
+    flight = fly(*SCENE, f"separation.mode={mode}", at={TAKEN_S: take, MOVED_S: move}, until=has_passed)
     assert flight.separation_m() >= 0.85
-    way_m = flight.pos_ned_m[:, MOVED, 0]
-    assert way_m.min() < -4.0, "it has passed them"
 
 
-def steered(fly: Fly, settings: tuple[str, ...], legs: list[Leg], *, taken_s: float = TAKEN_S) -> float:
-    """Take the vehicle, and move it along legs; return the least separation [m] until 3 s after the last one."""
+def steered(
+    fly: Fly, settings: tuple[str, ...], legs: list[Leg], *, taken_s: float = TAKEN_S, too_close_m: float = 0.0
+) -> float:
+    """Take the vehicle, and move it along legs; return the least separation [m] until 3 s after the last one.
+
+    After the last one the flight ends when two are too close.
+    """
+    too_close = closer_than(too_close_m)
 
     def is_over(running: Lockstep) -> bool:
-        return mission_t_s(running) > legs[-1][0] + 3.0
+        after_s = mission_t_s(running) - legs[-1][0]
+        return after_s > 3.0 or (after_s > 0.1 and too_close(running))
 
     at = {taken_s: take, **{at_s: functools.partial(move, **leg) for at_s, leg in legs}}
     return fly(*settings, at=at, until=is_over).separation_m()
@@ -109,7 +115,7 @@ def test_who_is_flown_at_another_as_soon_as_it_is_taken_is_not_taken_to_brake(
     scene = (*COARSE, *PASSING)
     assert steered(fly, scene, at_once, taken_s=2.4) >= 0.75
     taken_to_stop(monkeypatch)
-    assert steered(fly, scene, at_once, taken_s=2.4) < 0.65, "negative control"
+    assert steered(fly, scene, at_once, taken_s=2.4, too_close_m=0.65) < 0.65, "negative control"
 
 
 def test_guaranteed_who_is_flown_past_others_as_soon_as_it_is_taken_is_not_taken_to_brake(
@@ -121,7 +127,7 @@ def test_guaranteed_who_is_flown_past_others_as_soon_as_it_is_taken_is_not_taken
     at_once: list[Leg] = [(TAKEN_S + 0.04, {"to_ned_m": (-4.0, 3.7, -5.0), "speed_m_s": 3.0})]
     assert steered(fly, scene, at_once) >= 0.85
     taken_to_stop(monkeypatch)
-    assert steered(fly, scene, at_once) < 0.7, "negative control"
+    assert steered(fly, scene, at_once, too_close_m=0.7) < 0.7, "negative control"
 
 
 def test_who_slows_down_in_its_turns_does_not_stop(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,4 +138,4 @@ def test_who_slows_down_in_its_turns_does_not_stop(fly: Fly, monkeypatch: pytest
     ]
     assert steered(fly, SCENE, turns) >= 0.85
     taken_to_stop(monkeypatch, for_us=1_000_000)
-    assert steered(fly, SCENE, turns) < 0.75, "negative control"
+    assert steered(fly, SCENE, turns, too_close_m=0.75) < 0.75, "negative control"
