@@ -6,6 +6,7 @@ each other's messages in every tick, 87 % of all bytes, and so kept each other l
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -19,16 +20,18 @@ GUARANTEED = ("sitl.start=air", "separation.mode=guaranteed")
 TICKS = 130  # in which it lasts
 
 
-def flown(begin: Callable[[Lockstep], None]) -> Flight:
-    """Return two and a half seconds of a swap of eight that begin when something does."""
-    return fly_now(
-        *GUARANTEED, config="swap8.toml", at={1.0: begin}, until=lambda lockstep: mission_t_s(lockstep) > 3.6
-    )
-
-
-def relays(flight: Flight) -> list[int]:
+def relays(lockstep: Lockstep) -> list[int]:
     """Return how many messages of others each agent has passed on, several at once counted as one."""
-    return [agent.sent.get("relay", {}).get("messages", 0) for agent in flight.lockstep.agents if agent]
+    return [agent.sent.get("relay", {}).get("messages", 0) for agent in lockstep.agents if agent]
+
+
+def flown(begin: Callable[[Lockstep], None], enough: float = math.inf) -> Flight:
+    """Return two and a half seconds of a swap of eight that begin when something does, or until enough is relayed."""
+
+    def until(lockstep: Lockstep) -> bool:
+        return mission_t_s(lockstep) > 3.6 or sum(relays(lockstep)) > enough
+
+    return fly_now(*GUARANTEED, config="swap8.toml", at={1.0: begin}, until=until)
 
 
 def held_up(lockstep: Lockstep) -> None:
@@ -43,18 +46,18 @@ def cut_off(lockstep: Lockstep) -> None:
 
 
 def test_nothing_is_passed_on_of_agents_that_are_held_up() -> None:
-    assert sum(relays(flown(held_up))) == 0
+    assert sum(relays(flown(held_up).lockstep)) == 0
 
 
 def test_negative_control_by_silence_alone_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PeerTrajectories, "lacked_us", lambda *_: 1_000_000)
-    assert sum(relays(flown(held_up))) > 20
+    assert sum(relays(flown(held_up, 20).lockstep)) > 20
 
 
 def test_two_of_six_that_could_pass_on_what_two_others_lack_of_each_other() -> None:
     """The peer has to say that it lacks something, and then that it has it: five ticks or more for each message."""
     flight = flown(cut_off)
-    counts = relays(flight)
+    counts = relays(flight.lockstep)
     assert flight.separation_m() >= 0.85
     assert TICKS / 8 < max(counts) < TICKS / 3
     assert sum(count > 5 for count in counts) <= 4, "two for each of the two"
