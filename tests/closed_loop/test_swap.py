@@ -43,14 +43,13 @@ def test_eight_agents_swap_without_touching(fly: Fly) -> None:
         assert not acted.any(), "the safety filter is not what keeps them apart"
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_eight_agents_swap_from_starts_a_millimetre_off(fly: Fly, seed: int) -> None:
+def test_eight_agents_swap_from_starts_a_millimetre_off(fly: Fly) -> None:
     """Which agent yields differs between starts, and so does the duration.
 
     Without the safety filter, as that is not what keeps them apart; it acts from one of six starts, on who pass fast.
     """
     sets = ("mission.duration_s=20", "agent.barrier.enabled=false")
-    check(fly(*SWAP, *sets, config="swap8.toml", until=all_arrived, seed=seed))
+    check(fly(*SWAP, *sets, config="swap8.toml", until=all_arrived, seed=1))
 
 
 FOUR = (
@@ -69,7 +68,7 @@ def four_meet(fly: Fly, seed: int, *sets: str) -> Flight:
     return fly(*FOUR, *sets, config="swap8.toml", until=lambda now: mission_t_s(now) >= 5.0, seed=seed)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, *CLOSE])
+@pytest.mark.parametrize("seed", [0, *CLOSE])
 def test_four_agents_that_meet_keep_their_distance_from_every_start(fly: Fly, seed: int) -> None:
     """The worst of 24 starts shifted by millimetres are 0.881 and 0.885 m."""
     assert four_meet(fly, seed).separation_m() >= 0.85
@@ -86,10 +85,10 @@ def test_negative_control_without_room_for_those_who_come_closer_four_come_close
 def test_four_agents_that_damp_their_plans_arrive_sooner(fly: Fly, more: tuple[str, ...], latest_s: float) -> None:
     """They plan at the same time, each with what the others planned before, and overshoot.
 
-    From twelve starts they arrive after 7.2 s on average, and after 7.9 s without the proximal term; from these four
-    after 6.8 and 8.6 s.
+    From twelve starts they arrive after 7.2 s on average, and after 7.9 s without the proximal term; from these two
+    after 7.0 and 9.1 s.
     """
-    arrived_s = [four_arrive(fly, seed, *more) for seed in (0, 1, 4, 5)]
+    arrived_s = [four_arrive(fly, seed, *more) for seed in (0, 5)]
     assert np.mean(arrived_s) <= latest_s
     assert latest_s < math.inf or np.mean(arrived_s) > 8.0
 
