@@ -34,7 +34,8 @@ def test_summed_mean_tracking_error(circle: Flight) -> None:
 
 def test_without_more_room_for_who_comes_closer_the_error_is_within_3_percent_of_its_lower_bound(fly: Fly) -> None:
     """Agents in a formation swing by centimetres, for which `separation.approach_01` keeps room: 2 to 3 %."""
-    flight = fly(FINE, "separation.approach_01=0", "sitl.start=air", until=Lockstep.mission_is_over)
+    a_period = "mission.duration_s=22.6"  # of the circle, after the first 10 s
+    flight = fly(FINE, "separation.approach_01=0", "sitl.start=air", a_period, until=Lockstep.mission_is_over)
     assert flight.summed_mean_error_m(after_s=10.0) <= 1.03 * np.sqrt(3) * 0.9
 
 
@@ -62,7 +63,8 @@ def test_vehicles_come_down_a_metre_apart(circle: Flight) -> None:
 
 
 def test_negative_control_agents_that_ignore_each_other_collide(fly: Fly) -> None:
-    alone = fly("controller.kind='mpc'", "agent.barrier.enabled=false", "mission.duration_s=5", until=closer_than(0.3))
+    unaware = ("controller.kind='mpc'", "agent.barrier.enabled=false")
+    alone = fly(*unaware, "sitl.start=air", "mission.duration_s=5", until=closer_than(0.3))
     assert alone.separation_m() < 0.3
 
 
