@@ -61,13 +61,12 @@ def test_wind_gusts_mass_and_battery_cost_centimetres() -> None:
     assert found.largest_down_m <= 0.02
 
 
-@pytest.mark.parametrize("seed", [1, 3, 5])
-def test_additional_turbulence_costs_centimetres(seed: int) -> None:
+def test_additional_turbulence_costs_centimetres() -> None:
     """Of eight seeds seven are 0.050 to 0.071 m, of which 5 is the worst.
 
     With seed 2 the vehicle is not on the circle yet when the error begins to count: wind and weight leave it little.
     """
-    assert errors(*WIND, *HEAVY, *GUSTS, *EDDIES, f"seed={seed}").rmse_m <= 0.075
+    assert errors(*WIND, *HEAVY, *GUSTS, *EDDIES, "seed=5").rmse_m <= 0.075
 
 
 def test_at_rest_no_error_remains() -> None:
