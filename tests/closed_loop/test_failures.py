@@ -28,18 +28,23 @@ def landed_by_itself(flight_truth: np.ndarray, agent: int, agents: int = 3) -> b
     return bool(rows["landed"][-1] == Landed.ON_GROUND and not rows["armed"][-1])
 
 
-@pytest.mark.parametrize(("victim", "at_s"), [(0, 5.0), (1, 8.0)])
-def test_a_dead_agent_lands_and_the_others_keep_clear(fly: Fly, victim: int, at_s: float) -> None:
+def has_landed(running: Lockstep, agent: int = 0) -> bool:
+    """Return whether the vehicle of the agent that died is down."""
+    vehicle = running.world.truth_rows()[agent]
+    return running.agents[agent] is None and bool(vehicle["landed"] == Landed.ON_GROUND and not vehicle["armed"])
+
+
+def test_a_dead_agent_lands_and_the_others_keep_clear(fly: Fly) -> None:
     """The mission goes on for three seconds, in which the others have left the dead one 7 m behind."""
-    flight = fly(f"mission.duration_s={at_s + 3.0}", at={at_s: lambda running: running.kill(victim)})
-    assert landed_by_itself(flight.lockstep.truth, victim)
+
+    def over(running: Lockstep) -> bool:
+        others = [log.rows[-1]["phase"][0] for log in running.logs[::2] if log.rows]
+        return has_landed(running, 1) and min(others) > Phase.TRACK
+
+    flight = fly("mission.duration_s=8", at={5.0: lambda running: running.kill(1)}, until=over)
+    assert landed_by_itself(flight.lockstep.truth, 1)
     assert flight.separation_m() >= 0.85
-    assert flight.problems == [f"agent {victim} died"], "the others finish"
-
-
-def has_landed(running: Lockstep) -> bool:
-    """The vehicle of the agent that died is down."""
-    return running.agents[0] is None and running.world.truth_rows()[0]["landed"] == Landed.ON_GROUND
+    assert flight.outcomes == {"completed"}, "of the others"
 
 
 CLUSTER = ("mission.circle.radius_m=0.0", "mission.circle.climb_ned_m_s=0.0", "mission.duration_s=12")
@@ -49,7 +54,7 @@ def test_negative_control_a_dead_agent_that_is_forgotten_is_closed_in_on(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three wait around one point; the one that dies sinks in its place, which the others would take."""
-    died = {8.0: lambda running: running.kill(0)}
+    died = {5.0: lambda running: running.kill(0)}
     remembered = fly(*CLUSTER, at=died, until=has_landed).separation_m(only=0)
     remember = PeerPaths.latest
 
@@ -92,21 +97,30 @@ PASSING = (
 )
 
 
-def dies_amid(end: Callable[[Lockstep], None]) -> float:
+TOUCH_M = 0.48
+
+
+def dies_amid(end: Callable[[Lockstep], None], too_close_m: float = 0.0) -> float:
     """Return how close vehicles come when one agent of four ends while they turn around another.
 
-    Starts are never shifted: only exactly symmetric ones make all four meet at 2.9 s.
+    Only exactly symmetric starts, as configured, make all four meet at 2.9 s. It ends when two are too close.
     """
-    return fly_now(*PASSING, at={2.9: end}, until=lambda running: mission_t_s(running) > 5.5).separation_m()
+    too_close = closer_than(too_close_m)
+
+    def until(running: Lockstep) -> bool:
+        return mission_t_s(running) > 5.5 or too_close(running)
+
+    return fly_now(*PASSING, at={2.9: end}, until=until).separation_m()
 
 
-@pytest.mark.parametrize("victim", [1, 3])
-@pytest.mark.parametrize("is_frozen", [False, True], ids=["killed", "frozen"])
+@pytest.mark.usefixtures("configured_starts")
+@pytest.mark.parametrize(("victim", "is_frozen"), [(1, False), (3, True)], ids=["killed", "frozen"])
 def test_others_keep_clear_of_where_the_last_attitude_takes_a_vehicle(
     monkeypatch: pytest.MonkeyPatch, victim: int, is_frozen: bool
 ) -> None:
     """Planned was to turn; the kept attitude leads straight among the others, who came to 0.15 to 0.25 m of it.
 
+    All four turn alike, so one is as good as another.
     Nobody vouches for the end of a frozen one, which may as well be cut off, and fly on.
     """
 
@@ -118,7 +132,7 @@ def test_others_keep_clear_of_where_the_last_attitude_takes_a_vehicle(
 
     assert dies_amid(end) >= 0.8
     monkeypatch.setattr(world_model, "without_setpoints", lambda path, **_: path)
-    assert dies_amid(end) < 0.48, "negative control: bodies touch where it is expected to turn as planned"
+    assert dies_amid(end, TOUCH_M) < TOUCH_M, "negative control: bodies touch where it is expected to turn as planned"
 
 
 def test_an_agent_that_is_started_again_at_once_does_not_hide_where_its_vehicle_drifts(
@@ -129,13 +143,18 @@ def test_an_agent_that_is_started_again_at_once_does_not_hide_where_its_vehicle_
     Of 30 flights (three starts, five times from 2.3 to 2.7 s, two agents) the least is 0.81 m, 0.74 m before.
     """
 
-    def restarted() -> float:
+    def restarted(too_close_m: float = 0.0) -> float:
         begin = {2.4: lambda running: running.kill(1), 2.5: lambda running: running.start_again(1)}
-        return fly_now(*PASSING, at=begin, until=lambda running: mission_t_s(running) > 4.4, seed=2).separation_m()
+        too_close = closer_than(too_close_m)
+
+        def until(running: Lockstep) -> bool:
+            return mission_t_s(running) > 4.4 or too_close(running)
+
+        return fly_now(*PASSING, at=begin, until=until, seed=2).separation_m()
 
     assert restarted() >= 0.85
     monkeypatch.setattr(world_model, "without_setpoints", lambda path, **_: path)
-    assert restarted() < 0.8, "negative control"
+    assert restarted(0.8) < 0.8, "negative control"
 
 
 def take_over(running: Lockstep) -> None:
@@ -150,8 +169,8 @@ def others_are_done(running: Lockstep) -> bool:
 
 
 def test_a_pilot_override_is_respected(fly: Fly) -> None:
-    landing = {8.0: take_over, 9.5: lambda running: running.command("land")}
-    flight = fly("mission.duration_s=14", AIR, at=landing, until=others_are_done)
+    landing = {5.0: take_over, 6.5: lambda running: running.command("land")}
+    flight = fly("mission.duration_s=11", AIR, at=landing, until=others_are_done)
     ticks = flight.ticks(2)
     overridden = ticks["mode"] == Mode.PILOT_OVERRIDE
     assert overridden.any()
@@ -218,9 +237,9 @@ def test_the_vehicle_of_a_dead_agent_keeps_its_attitude_for_half_a_second(
 def test_others_keep_clear_of_an_agent_without_a_solver(fly: Fly) -> None:
     """The agent replays its last plan, brakes, holds and finally lands."""
     broken = {
-        at_s: partial(break_solver, agent=0, lasts_s=lasts_s) for at_s, lasts_s in ((5.0, 0.3), (6.5, 2.0), (10.5, 8.0))
+        at_s: partial(break_solver, agent=0, lasts_s=lasts_s) for at_s, lasts_s in ((3.0, 0.3), (4.5, 2.0), (8.5, 8.0))
     }
-    flight = fly("mission.duration_s=16.5", at=broken)
+    flight = fly("mission.duration_s=14.5", at=broken)
     assert {Mode.REPLAY, Mode.BRAKE, Mode.HOLD, Mode.LAND} <= flight.modes(0)
     assert flight.separation_m() >= 0.85
     assert all(landed_by_itself(flight.lockstep.truth, agent) for agent in range(3))
@@ -236,19 +255,8 @@ def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: py
     assert uncertified < 0.3 < 0.6 < certified
 
 
-def test_ten_seconds_of_bus_silence(fly: Fly) -> None:
-    def silence(running: Lockstep) -> None:
-        running.hub.carry = lambda *_, **__: None  # type: ignore[method-assign]
-
-    def speak(running: Lockstep) -> None:
-        del running.hub.carry
-
-    flight = fly("mission.duration_s=20", AIR, at={5.0: silence, 15.0: speak}, until=Lockstep.mission_is_over)
-    assert flight.separation_m() >= 0.80
-
-
 def test_late_and_lost_messages(fly: Fly) -> None:
-    flight = fly("bus.delay_ms=40", "bus.loss_01=0.2", "mission.duration_s=10")
+    flight = fly("bus.delay_ms=40", "bus.loss_01=0.2", "mission.duration_s=6", AIR)
     assert flight.problems == []
     assert flight.separation_m() >= 0.85
 
