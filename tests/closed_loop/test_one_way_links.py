@@ -25,14 +25,16 @@ VICTIM = 1
 Direction = Literal["both", "from_vehicle", "to_vehicle"]
 
 
-def lost(flight: Lockstep, direction: Direction, *, after_s: float = 1.5, for_s: float = 17.0) -> float:
-    """Lose the victim's link in the middle of a swap; the least separation [m] from then on."""
+def lost(
+    flight: Lockstep, direction: Direction, *, after_s: float = 1.5, for_s: float = 17.0, too_close_m: float = 0.0
+) -> float:
+    """Lose the victim's link in the middle of a swap; the least separation [m] until two are too close."""
     while not mission_t_s(flight) >= after_s:
         flight.step()
     loss = FaultParams(kind="link_loss", vehicle=VICTIM, value=1.0, direction=direction)
     flight.world.faults.begin(loss, flight.world.since_boot_us)
     until_us, least_m = flight.clock.now_us() + round(for_s * 1e6), float("inf")
-    while flight.clock.now_us() < until_us:
+    while flight.clock.now_us() < until_us and least_m >= too_close_m:
         flight.step()
         least_m = min(least_m, float(closest_pair_m(flight.world.truth_rows()["pos_ned_m"][None])[0]))
     return least_m
@@ -45,20 +47,24 @@ def test_an_arducopter_that_its_agent_does_not_hear_lands_by_its_own_failsafe(di
     assert FlightMode(int(flight.world.truth_rows()["flight_mode"][VICTIM])) is FlightMode.LAND
 
 
+@pytest.mark.usefixtures("configured_starts")
 def test_negative_control_heartbeats_that_go_on_keep_it_flying_into_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lost 1.6 s into the swap; lost at 1.5 s, it flies past the others now."""
     monkeypatch.setattr(Autopilot, "is_attended", lambda autopilot, now_us: True)
     flight = Lockstep(load(ARDUCOPTERS, SWAP))
-    assert lost(flight, "from_vehicle", after_s=1.6) < 0.6
+    assert lost(flight, "from_vehicle", after_s=1.6, too_close_m=0.6) < 0.6
     assert FlightMode(int(flight.world.truth_rows()["flight_mode"][VICTIM])) is FlightMode.EXTERNAL
 
 
-def lost_amid_a_turn(after_s: float, config: Path | None, direction: Direction = "from_vehicle") -> float:
+def lost_amid_a_turn(
+    after_s: float, config: Path | None, direction: Direction = "from_vehicle", too_close_m: float = 0.0
+) -> float:
     """Lose what the victim's vehicle says, or hears, while four turn around each other; the least separation [m]."""
     flight = Lockstep(load(config, (*COARSE, *PASSING)))
-    return lost(flight, direction, after_s=after_s, for_s=4.0)
+    return lost(flight, direction, after_s=after_s, for_s=4.0, too_close_m=too_close_m)
 
 
+@pytest.mark.usefixtures("configured_starts")
 @pytest.mark.parametrize(("after_s", "config"), [(2.8, ARDUCOPTERS), (2.4, None)], ids=["arducopter", "px4"])
 def test_others_keep_clear_of_both_ways_that_a_link_may_have_failed(
     after_s: float, config: Path | None, monkeypatch: pytest.MonkeyPatch
@@ -76,9 +82,10 @@ def test_others_keep_clear_of_both_ways_that_a_link_may_have_failed(
         return known(publisher, state, t0_us)
 
     monkeypatch.setattr(PathPublisher, "_without_link", deaf)
-    assert lost_amid_a_turn(after_s, config) < 0.65, "negative control"
+    assert lost_amid_a_turn(after_s, config, too_close_m=0.65) < 0.65, "negative control"
 
 
+@pytest.mark.usefixtures("configured_starts")
 @pytest.mark.parametrize(("after_s", "config"), [(2.9, ARDUCOPTERS), (2.6, None)], ids=["arducopter", "px4"])
 def test_others_keep_clear_of_where_a_vehicle_that_misses_its_setpoints_flies(
     after_s: float, config: Path | None, monkeypatch: pytest.MonkeyPatch
@@ -90,13 +97,17 @@ def test_others_keep_clear_of_where_a_vehicle_that_misses_its_setpoints_flies(
     """
     assert lost_amid_a_turn(after_s, config, "to_vehicle") >= 0.85
     monkeypatch.setattr(HeardSetpoints, "unheard_since_us", lambda *times: None)
-    assert lost_amid_a_turn(after_s, config, "to_vehicle") < 0.76, "negative control"
+    assert lost_amid_a_turn(after_s, config, "to_vehicle", 0.76) < 0.76, "negative control"
 
 
-def least_with_a_filling_link_m() -> float:
-    """Fly the circle with a link from one vehicle whose delay grows by 20 ms a second; the least separation [m]."""
-    flight, begun_us, least_m = Lockstep(load(None, (*COARSE, "mission.duration_s=60"))), None, float("inf")
-    while begun_us is None or flight.clock.now_us() - begun_us < 25_000_000:
+def least_with_a_filling_link_m(too_close_m: float = 0.0) -> float:
+    """Fly the circle with a link from one vehicle whose delay grows by 20 ms a second; the least separation [m].
+
+    The flight ends after 25 s of it, or when two are too close.
+    """
+    flight = Lockstep(load(None, (*COARSE, "sitl.start=air", "mission.duration_s=60")))
+    begun_us, least_m = None, float("inf")
+    while begun_us is None or (flight.clock.now_us() - begun_us < 25_000_000 and least_m >= too_close_m):
         flight.step()
         now_us = flight.clock.now_us()
         if begun_us is None:
@@ -122,4 +133,4 @@ def test_negative_control_who_halves_what_a_round_trip_has_grown_by_comes_close(
 
     monkeypatch.setattr("swarmctl.mavlink.vehicle.vehicle_clock._QUESTIONS", 32)
     monkeypatch.setattr(VehicleClock, "_one_way_delay_us", property(halved_us))
-    assert least_with_a_filling_link_m() < 0.5
+    assert least_with_a_filling_link_m(0.5) < 0.5
