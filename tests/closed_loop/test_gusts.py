@@ -109,7 +109,8 @@ def sunken_in_wind(wind_m_s: float, towards_deg: float) -> tuple[float, str]:
         told.append(running.agents[0]._publisher.active_alert)
 
     settings = ("swarm.agents=1", "mission.duration_s=10", f"sitl.wind.mean_ned_m_s=[{north:.3f},{east:.3f},0]")
-    flight = fly_now("sitl.start=air", *settings, config=X500.name, at={4.0: note_alert})
+    over = Lockstep.mission_is_over
+    flight = fly_now("sitl.start=air", *settings, config=X500.name, at={4.0: note_alert}, until=over)
     _, error_ned_m = flight.tracked(0)
     return float(error_ned_m[:, 2].max()), "" if told[0] is None else told[0].text
 
@@ -128,16 +129,16 @@ def test_a_wind_that_thrust_does_not_hold_costs_place_and_not_height(
 
 def drifted_in_hold_m() -> float:
     """Return how far a wind of 7 m/s, after 20 s, has carried one that is held below a mission that climbs on."""
-    blows = "sitl.faults=[{kind='wind',vehicle=0,at_s=30,value=7,towards_deg=0}]"
-    climbs = ("sitl.start=air", "swarm.agents=1", "mission.duration_s=60", "mission.circle.climb_ned_m_s=-0.3", blows)
+    blows = "sitl.faults=[{kind='wind',vehicle=0,at_s=20,value=7,towards_deg=0}]"
+    climbs = ("sitl.start=air", "swarm.agents=1", "mission.duration_s=60", "mission.circle.climb_ned_m_s=-0.6", blows)
     flight = fly_now(
         *climbs,
         "controller.mpc.thrust_max_m_s2=12.5",
         config=X500.name,
         at={3.0: lambda running: running.command("hold")},
-        until=lambda running: running.clock.now_us() >= 50_000_000,
+        until=lambda running: running.clock.now_us() >= 40_000_000,
     )
-    before = int(np.searchsorted(flight.t_s, 29.0))
+    before = int(np.searchsorted(flight.t_s, 19.0))
     return float(np.linalg.norm(flight.pos_ned_m[-1, 0] - flight.pos_ned_m[before, 0]))
 
 
