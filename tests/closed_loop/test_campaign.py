@@ -119,7 +119,7 @@ def test_a_disturbance_of_every_vehicle_has_a_flight_alone_to_compare_with() -> 
 
 def test_two_halves_that_stay_apart_stop_and_are_not_asked_to_arrive() -> None:
     cell = replace(GUARANTEED_SWAP, agents=2, disturbance="split:0")
-    flight = TrialFlight(Trial(cell, 1), replace(drawn(cell, 1), limit_s=14.0))
+    flight = TrialFlight(Trial(cell, 1), replace(drawn(cell, 1), limit_s=10.0))
     flight.run()
     row = flight.row(None) | {"cpu_s": 0.0}
     assert (row["outcome"], row["arrived"], row["collided"]) == ("stopped", None, False)
