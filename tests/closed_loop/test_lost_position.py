@@ -20,7 +20,7 @@ LANDED_M = 4.0  # from where it took off: lost 6 s, until the estimator has said
 SEPARATION_M = 0.85
 TOO_CLOSE_M = 0.6
 ENDED_S = 40.0  # start 14 s, loss 3 s, braking 4 s, landing 9 s; waiting for room lasts 20 s
-ALONE = ("swarm.agents=1", "mission.kind=hover", "mission.duration_s=60")
+ALONE = ("swarm.agents=1", "mission.kind=hover", "mission.duration_s=40")
 # It drifts towards the peer 1.2 m away, who gives way by what the estimator has told by then.
 BESIDE = (
     "swarm.agents=2",
