@@ -111,7 +111,10 @@ def clearance_m(fly: Fly) -> float:
         running.set_obstacles([COMING])
         began_s.append(running.clock.now_us() * 1e-6)
 
-    flight = fly(*AHEAD, config="x500_circle.toml", at={1.0: add})
+    def past(running: Lockstep) -> bool:
+        return bool(running.world.truth_rows()["pos_ned_m"][0, 0] > COMING.center_ned_m[0])
+
+    flight = fly(*AHEAD, config="x500_circle.toml", at={1.0: add}, until=past)
     since_s = flight.t_s[flight.t_s >= began_s[0]] - began_s[0]
     centers = COMING.center_after(since_s[:, None])
     places = flight.pos_ned_m[flight.t_s >= began_s[0], 0]
@@ -122,6 +125,7 @@ def test_a_body_that_flies_at_an_obstacle_does_not_touch_it(fly: Fly) -> None:
     assert clearance_m(fly) > 0.5 * X500_BODY_M + 0.1
 
 
+@pytest.mark.usefixtures("configured_starts")
 def test_negative_control_with_tilts_bounded_by_the_wanted_thrust_it_does(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:

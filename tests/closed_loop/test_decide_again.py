@@ -77,6 +77,7 @@ def test_the_keys_of_its_vehicles_are_needed_by_nobody_who_decides_a_run_again(f
     assert [agent.plans_differ for agent in decisions_of_run(copy, ())] == [0, 0]
 
 
+@pytest.mark.usefixtures("configured_starts")
 def test_messages_that_come_late_are_known_in_the_tick_that_took_them(tmp_path: Path) -> None:
     """As in a launch, where they come whenever they come: they were given to the ticks that follow their stamps.
 

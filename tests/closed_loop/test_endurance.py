@@ -25,7 +25,7 @@ PAIR = (
 
 def drained(charge_01: float, *overrides: str) -> Flight:
     """Fly a pair; in the first seconds of the mission the battery of vehicle 0 is down to a charge."""
-    drain = f"sitl.faults=[{{kind='battery', vehicle=0, value={charge_01}, at_s=7.5}}]"
+    drain = f"sitl.faults=[{{kind='battery', vehicle=0, value={charge_01}, at_s=3.5}}]"
     return fly_now(*PAIR, drain, *overrides, until=None if not overrides else Lockstep.mission_is_over)
 
 

@@ -121,6 +121,7 @@ def newest_wins(self: SenderVerifier, received: ReceivedMessage, utc_us: int) ->
     return ""
 
 
+@pytest.mark.usefixtures("configured_starts")
 def test_negative_control_where_the_newest_is_believed_they_meet(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SenderVerifier, "_refusal", newest_wins)
     flight = swap(fly, at={FORGED_S: forge_paths}, until_s=5.0)
