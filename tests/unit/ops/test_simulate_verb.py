@@ -51,26 +51,27 @@ def test_a_window_that_can_not_be_opened_changes_no_exit_code(
         assert f"rerun --port auto {tmp_path}/run-{code}/telemetry.rrd" in capsys.readouterr().err
 
 
+def long_simulation(folder: Path) -> list[str]:
+    """Return the command of one that is to be interrupted."""
+    longer = ("--duration", "600", "--run-dir", str(folder))
+    return [sys.executable, "-m", "sitl.simulate", *SHORT[:2], *COARSE, *longer]
+
+
+def until_it_flies(folder: Path) -> None:
+    until_s = time.monotonic() + 60.0
+    while not (folder / "agent-0.tlog").exists() and time.monotonic() < until_s:
+        time.sleep(0.05)
+
+
 def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:
     """The kernel and the shell both send SIGHUP: the second one is no second request."""
     folder = tmp_path / "run"
     master, terminal = pty.openpty()
-    command = [
-        sys.executable,
-        "-m",
-        "sitl.simulate",
-        *SHORT[:2],
-        *COARSE,
-        "--duration",
-        "600",
-        "--run-dir",
-        str(folder),
-    ]
-    process = subprocess.Popen(command, stdin=terminal, stdout=terminal, stderr=terminal, start_new_session=True)
+    process = subprocess.Popen(
+        long_simulation(folder), stdin=terminal, stdout=terminal, stderr=terminal, start_new_session=True
+    )
     os.close(terminal)
-    until_s = time.monotonic() + 60.0
-    while not (folder / "agent-0.tlog").exists() and time.monotonic() < until_s:
-        time.sleep(0.05)
+    until_it_flies(folder)
     time.sleep(1.0)
     os.close(master)
     for _ in range(2):
@@ -82,21 +83,8 @@ def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:
 
 def test_a_simulation_that_flies_is_not_finished_by_a_report(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    command = [
-        sys.executable,
-        "-m",
-        "sitl.simulate",
-        *SHORT[:2],
-        *COARSE,
-        "--duration",
-        "600",
-        "--run-dir",
-        str(folder),
-    ]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    until_s = time.monotonic() + 60.0
-    while not (folder / "agent-0.tlog").exists() and time.monotonic() < until_s:
-        time.sleep(0.05)
+    process = subprocess.Popen(long_simulation(folder), stdout=subprocess.DEVNULL)
+    until_it_flies(folder)
     time.sleep(1.0)  # until it heeds signals
     with pytest.raises(StartError, match="is still written"):
         report_run(folder, Rules(agents=1, required_separation_m=0.5))
