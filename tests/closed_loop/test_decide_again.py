@@ -114,7 +114,8 @@ def test_frames_that_a_tick_reads_after_its_begin_are_known_in_it(folder: Path, 
 
 def test_another_parameter_is_seen_where_it_matters(folder: Path) -> None:
     """Negative control: who may tilt less decides otherwise, from the moment on at which it is in control."""
-    for agent in decisions_of_run(folder, ["controller.mpc.u_max=0.05", "agent.state_machine.accel_m_s2=0.4"]):
+    weaker = ["controller.mpc.u_max=0.05", "agent.state_machine.accel_m_s2=0.4", "separation.stop_m_s2=0.4"]
+    for agent in decisions_of_run(folder, weaker):
         assert agent.tilt_rad["max"] > 0.05
         assert agent.differences[0].was.split(",")[0] in ("GOTO_START", "READY")
         assert sum(found.ticks for found in agent.differences) > 100

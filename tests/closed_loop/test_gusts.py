@@ -144,7 +144,7 @@ def drifted_in_hold_m() -> float:
 
 def test_who_is_held_below_a_mission_that_climbs_has_not_sunk(monkeypatch: pytest.MonkeyPatch) -> None:
     assert drifted_in_hold_m() < 3.0
-    of_mission = property(lambda references: float(references.reference(np.zeros(3))[1].pos_ned_m[0, 2]))
+    of_mission = property(lambda references: float(references.reference(np.zeros(3), np.zeros(3))[1].pos_ned_m[0, 2]))
     monkeypatch.setattr(ReferenceSelector, "followed_z_m", of_mission)
     assert drifted_in_hold_m() > 20.0, "negative control"
 

@@ -89,7 +89,7 @@ def test_the_error_counts_from_the_file_while_an_operator_holds_and_on_the_way_b
 
 
 def test_negative_control_a_controller_without_authority_does_not_fly_it(fly: Fly, figure_8: Path) -> None:
-    weakly = ("controller.mpc.u_max=0.02", "agent.state_machine.accel_m_s2=0.19")
+    weakly = ("controller.mpc.u_max=0.02", "agent.state_machine.accel_m_s2=0.19", "separation.stop_m_s2=0.19")
     weak = fly(*own(figure_8), *weakly, "mission.duration_s=5", until=Lockstep.mission_is_over)
     ticks, error = weak.tracked(0)
     assert float(np.sqrt(np.mean(np.sum(error[ticks["mission_t_s"] > 2.0] ** 2, axis=1)))) > 0.2
