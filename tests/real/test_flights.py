@@ -13,7 +13,7 @@ import pytest
 from swarmctl.core.types import Phase
 from tests.benches.launches import Launched
 from tests.benches.standstill import STILL_S, stood_still_s
-from tests.real.autopilots import ARDUCOPTER, PX4
+from tests.real.autopilots import ARDUCOPTER, PX4, Kind
 from tests.real.conftest import Field, Fielder
 from tests.real.witness import Seen
 
@@ -23,6 +23,7 @@ PX4_CONFIG, ARDUPILOT_CONFIG = "configs/px4_udp.toml", "configs/ardupilot_udp.to
 LONE_PX4 = ("--set", "swarm.agents=1", "--set", 'vehicles=[{sysid=1, url="udpin://127.0.0.1:14540"}]')
 TAKEOFF_HEIGHT = "MIS_TAKEOFF_ALT"  # of a PX4
 END_S = 240.0
+FAR_M = 30.0
 MOST_REPEATED = 2  # flights that do not count
 PLACED_S = 120.0
 BODIES_M = 0.65  # tip to tip
@@ -85,6 +86,25 @@ def test_a_lone_px4_tracks_its_circle(field: Fielder) -> None:
     assert here.witness.read_parameter(0, TAKEOFF_HEIGHT) == takeoff_m, "its climb had another height"
     assert launched.summary()["tracking"]["agents"][0]["steady_rmse_m"] < 0.08
     assert true_rmse_m(launched, here.witness.vehicles[0]) < 0.8  # its estimate is 0.3 to 0.6 m off
+
+
+def beyond_m(launched: Launched, seen: Seen) -> float:
+    """Return how far a vehicle was flown past a reference that stands `FAR_M` north of the origin."""
+    table = pq.read_table(Path(launched.run_dir) / "agent-0.parquet")
+    tracked_s = table.column("t_us").to_numpy()[table.column("phase").to_numpy() == Phase.TRACK] * 1e-6
+    north_m = seen.at(tracked_s)[:, 0]
+    assert north_m[-1] == pytest.approx(FAR_M, abs=1.0), "it got there"
+    assert np.polyfit(tracked_s[:100] - tracked_s[0], north_m[:100], 1)[0] > 1.0, "at once"
+    return float(north_m.max() - north_m[-1])
+
+
+@pytest.mark.parametrize(("kind", "config"), [(PX4, (PX4_CONFIG, *LONE_PX4)), (ARDUCOPTER, (ARDUPILOT_CONFIG,))])
+def test_a_reference_far_away_is_not_flown_past(field: Fielder, kind: Kind, config: tuple[str, ...]) -> None:
+    """Plans alone brake 3.4 m too late."""
+    here = booted(field, 1) if kind is ARDUCOPTER else field(kind, 1, is_alone=True)
+    points = f"mission.waypoints.lists=[{{points_ned_m=[[{FAR_M},0,-4],[{FAR_M},0.5,-4]]}}]"
+    there = ("--set", "start.positions_ned_m=[[0,0,-4]]", "--set", "mission.kind=waypoints", "--set", points)
+    assert beyond_m(flown_in_time(here, *config, *there, "--duration", "20"), here.witness.vehicles[0]) < 0.5
 
 
 @pytest.mark.parametrize("after_boot_s", [0, 2, 5, 20])
