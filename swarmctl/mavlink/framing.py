@@ -1,4 +1,4 @@
-"""Frame boundaries of MAVLink in streams of bytes, received and sent. Who passes a judge has checksums verified."""
+"""Frame boundaries of MAVLink in streams of bytes, received and sent. Checksums are verified by a `judge` alone."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from swarmctl.core.types import Array
 _FAR_S = 0.8  # at the largest speed: what is nearer is braked for
 _LEAST_SINK_M_S = 0.3  # however little thrust is left
 _OF_BRAKING = 0.85  # share of the largest deceleration with which speeds fall on the way
-_SEEN_EARLY = 3.0  # speed that controllers brake from by themselves, in decelerations by `_FAR_S`; at 4 they are late
+_BRAKED_IN_TIME = 3.0  # times `_FAR_S` of deceleration: the speed from which plans stop by themselves; from 4 too late
 _NEARLY = 0.9  # share of the speed on the way from which on it is told
 
 
@@ -36,7 +36,7 @@ class Approach:
         accel_max_m_s2 = mpc.accel_max_m_s2(vehicle)
         self._speed_max_m_s, self._brake_m_s2 = vehicle.speed_max_m_s, _OF_BRAKING * accel_max_m_s2
         self._sink_max_m_s = max(_LEAST_SINK_M_S, _FAR_S * (mpc.most_thrust_m_s2(vehicle) - GRAVITY_M_S2))
-        near_s = _SEEN_EARLY * min(_FAR_S, mpc.horizon_xy * mpc.dt_s)
+        near_s = _BRAKED_IN_TIME * min(_FAR_S, mpc.horizon_xy * mpc.dt_s)
         self._near_m_s = accel_max_m_s2 * near_s
         self._near_m = 0.5 * self._near_m_s * near_s / _OF_BRAKING if plans else math.inf
 
@@ -57,11 +57,12 @@ class Approach:
         way_ned_m = pos_ned_m - own_ned_m
         far_m, down_m = np.sqrt((way_ned_m * way_ned_m).sum(axis=1)), way_ned_m[:, 2]
         if far_m[0] > self._near_m:
-            direction = way_ned_m[0] / far_m[0]
-            stops_m_s = math.sqrt(self._near_m_s**2 + 2.0 * self._brake_m_s2 * float(far_m[0] - self._near_m))
+            away_m, direction = float(far_m[0]), way_ned_m[0] / far_m[0]
+            stops_m_s = math.sqrt(self._near_m_s**2 + 2.0 * self._brake_m_s2 * (away_m - self._near_m))
             if float((own_ned_m_s - vel_ned_m_s[0]) @ direction) > _NEARLY * stops_m_s:
-                speed_m_s = min(stops_m_s, self._faster_m_s(vel_ned_m_s[0], direction))
-                return self._braking(pos_ned_m, vel_ned_m_s, ahead_s, way_ned_m[0], speed_m_s)
+                closing_m_s = min(stops_m_s, self._faster_m_s(vel_ned_m_s[0], direction))
+                left_m, slower_m_s = self._braking(ahead_s, away_m, closing_m_s)
+                return pos_ned_m - left_m[:, None] * direction, vel_ned_m_s + slower_m_s[:, None] * direction
         ahead_or_near_s = np.maximum(ahead_s, _FAR_S)
         if (far_m <= self._speed_max_m_s * ahead_or_near_s).all() and (
             down_m <= self._sink_max_m_s * ahead_or_near_s
@@ -80,13 +81,8 @@ class Approach:
         sinks_m_s = (self._sink_max_m_s - float(vel_ned_m_s[2])) / down if down > 0.0 else math.inf
         return max(0.0, min(self._speed_max_m_s - float(vel_ned_m_s @ direction), sinks_m_s))
 
-    def _braking(
-        self, pos_ned_m: Array, vel_ned_m_s: Array, ahead_s: Array, way_ned_m: Array, speed_m_s: float
-    ) -> tuple[Array, Array]:
-        """Return the way along which a vehicle, `way_ned_m` (3,) away from the reference, stops beside it."""
-        far_m = float(np.sqrt(way_ned_m @ way_ned_m))
-        braked_s = np.minimum(ahead_s, speed_m_s / self._brake_m_s2)
-        left_m = far_m - (speed_m_s - 0.5 * self._brake_m_s2 * braked_s) * braked_s
-        slower_m_s = speed_m_s - self._brake_m_s2 * braked_s
-        direction = way_ned_m / far_m
-        return pos_ned_m - left_m[:, None] * direction, vel_ned_m_s + slower_m_s[:, None] * direction
+    def _braking(self, ahead_s: Array, away_m: float, closing_m_s: float) -> tuple[Array, Array]:
+        """Return the distance [m] and the closing speed [m/s] (N,) that are left of these while a vehicle brakes."""
+        braked_s = np.minimum(ahead_s, closing_m_s / self._brake_m_s2)
+        left_m = away_m - (closing_m_s - 0.5 * self._brake_m_s2 * braked_s) * braked_s
+        return left_m, closing_m_s - self._brake_m_s2 * braked_s

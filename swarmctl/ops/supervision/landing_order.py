@@ -23,11 +23,11 @@ class LandingOrder:
 
     def give(self, now_s: float, timeout_s: float) -> bool:
         """Give the order, which is to be obeyed within a time; return whether it is the first one."""
-        is_first = self._given_s is None
-        if is_first:
-            self._given_s, self._until_s = now_s, now_s + timeout_s
-        self._until_s = min(self._until_s, now_s + timeout_s)
-        return is_first
+        if self._given_s is not None:
+            self._until_s = min(self._until_s, now_s + timeout_s)
+            return False
+        self._given_s, self._until_s = now_s, now_s + timeout_s
+        return True
 
     def since_s(self, now_s: float) -> float:
         """Return for how long it has been given."""
