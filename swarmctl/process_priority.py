@@ -1,4 +1,4 @@
-"""Real-time priority (SCHED_RR) for what flies, and a low one for what only watches.
+"""Real-time priority (SCHED_RR) or a processor for what flies, and a low priority for what only watches.
 
 Other programs then wait, and not setpoints or vehicle states.
 """
@@ -54,6 +54,16 @@ def is_realtime_permitted() -> bool:
     asking.start()
     asking.join()
     return granted == [True]
+
+
+def bind_to_processor(pid: int, processor: int) -> None:
+    """Let a process that has just been started run on one processor alone, with all threads that it will start.
+
+    Where the system binds none, or the process has ended, nothing happens.
+    """
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(pid, {processor})
 
 
 def give_way() -> None:

@@ -31,6 +31,7 @@ class AgentParams(Params):
 
     rate_hz: float = Field(50.0, ge=10, le=200)  # rate of ticks, and so of setpoints
     realtime: bool = True  # launch schedules what flies before other programs, if it may
+    pinned: bool = False  # launch binds each process of agents to one processor, in turns from the last one on
     connect_timeout_s: float = Field(15.0, gt=0, le=600)  # longest wait for the first heartbeat and position
     path_sharing: PathSharingParams = PathSharingParams()
     state_machine: StateMachineParams = StateMachineParams()

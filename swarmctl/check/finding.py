@@ -9,13 +9,14 @@ from typing import Protocol
 from swarmctl.core.verdict import Verdict
 
 SWARM = -1  # agent of a finding about all vehicles together
+COMPUTER = -2  # of one about the computer that the check runs on
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
     """One line of a check."""
 
-    agent: int  # agent id, or SWARM
+    agent: int  # agent id, SWARM or COMPUTER
     topic: str
     verdict: Verdict
     found: str

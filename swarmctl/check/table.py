@@ -13,7 +13,7 @@ from rich.text import Text
 
 from swarmctl.bus.bus import agent_name
 from swarmctl.check.change import Change
-from swarmctl.check.finding import SWARM, Finding, worst_first
+from swarmctl.check.finding import COMPUTER, SWARM, Finding, worst_first
 from swarmctl.check.scan.link_facts import VehicleFacts
 from swarmctl.core.json_safe import json_safe
 from swarmctl.core.text import printable
@@ -21,6 +21,7 @@ from swarmctl.core.verdict import Verdict
 
 _LINE = 2000  # characters of one line of the list
 _COLUMNS = ("vehicle", "what", "found", "wanted", "verdict")
+_NO_VEHICLES = {SWARM: "swarm", COMPUTER: "computer"}
 _STYLES = {Verdict.OK: "green", Verdict.NOTE: "yellow", Verdict.FIX: "bold red"}
 
 
@@ -51,7 +52,7 @@ def as_json(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes:
 
 def _drawn(lines: Sequence[Finding]) -> Table:
     """Return a table with a section for each vehicle, and one for what is the same of several of them."""
-    vehicles = {line.agent for line in lines} - {SWARM}
+    vehicles = {line.agent for line in lines} - _NO_VEHICLES.keys()
     alike: dict[tuple[str, ...], list[int]] = {}
     for line in lines:
         alike.setdefault(_cells(line)[1:], []).append(line.agent)
@@ -76,7 +77,7 @@ def _cells(line: Finding) -> tuple[str, ...]:
 
 
 def _who(agent: int) -> str:
-    return "swarm" if agent == SWARM else agent_name(agent)
+    return _NO_VEHICLES.get(agent) or agent_name(agent)
 
 
 def _after_table(

@@ -122,6 +122,9 @@ def launch(
     sets: Set = None,
     view: View = None,
     web: WebPage = False,
+    pin: Annotated[
+        bool, typer.Option("--pin", help="Bind each process of agents to one processor: agent.pinned=true.")
+    ] = False,
 ) -> int:
     """Start simulator, agents, bus and view, and fly. Ctrl-C lands; a second Ctrl-C kills every process."""
     from swarmctl.config import load
@@ -130,7 +133,8 @@ def launch(
     from swarmctl.telemetry.view.recordings import wants_window
 
     options = LaunchOptions(run_dir, wants_window(view, web=web), web)
-    return fly(load(config, _overrides(agents, duration, seed, sets)), options)
+    pinned = ["agent.pinned=true"] if pin else []
+    return fly(load(config, [*_overrides(agents, duration, seed, sets), *pinned]), options)
 
 
 @app.command()

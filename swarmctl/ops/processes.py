@@ -7,6 +7,7 @@ Every child has its own session, so that Ctrl-C in the terminal reaches the laun
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import secrets
 import signal
@@ -30,6 +31,7 @@ from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.text import printable
 from swarmctl.errors import StartError
 from swarmctl.process_lifetime import PARENT_ENV, module_command
+from swarmctl.process_priority import bind_to_processor
 from swarmctl.telemetry.recording.file_names import CONFIG, TRUTH, events_file
 
 ROUTER = "router"
@@ -43,12 +45,16 @@ _AGENTS_PER_PROCESSOR = 2  # more at real-time priority could leave nothing for 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One process to start: its name, its command line, the file descriptors it inherits, and its agents if any."""
+    """One process to start: its name, its command line, the file descriptors it inherits, and its agents if any.
+
+    One with a `processor` runs on that alone.
+    """
 
     name: str
     argv: tuple[str, ...]
     fds: tuple[int, ...] = ()
     agents: tuple[int, ...] = ()
+    processor: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,14 +85,14 @@ def wants_realtime(config: Config, agents: Sequence[int]) -> bool:
     """
     if sys.platform != "linux":
         return False
-    processes, processors = len(_shares(len(agents), config.swarm.agents_per_process)), _processors()
+    processes, processors = len(_shares(len(agents), config.swarm.agents_per_process)), len(usable_processors())
     is_little = len(agents) <= _AGENTS_PER_PROCESSOR * processors or processes <= processors
     return config.agent.realtime and is_little
 
 
-def _processors() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+def usable_processors() -> tuple[int, ...]:
+    """Return the numbers of the processors that this process may use, the least one first."""
+    return tuple(sorted(os.sched_getaffinity(0))) if sys.platform == "linux" else tuple(range(os.cpu_count() or 1))
 
 
 def router_command(context: RunContext, links: RouterLinks | None) -> Command:
@@ -114,6 +120,7 @@ def agent_commands(
         config_path: resolved configuration, when it is not in the run folder.
     """
     commands = []
+    last_first = itertools.cycle(reversed(usable_processors()))  # interrupts are often served by the first ones
     for places in _shares(len(context.agents), config.swarm.agents_per_process):
         argv = module_command("swarmctl", "agent", "--config", f"{config_path or context.directory / CONFIG}")
         argv += ("--run", context.run, "--bus", context.endpoint, "--run-dir", f"{context.directory}")
@@ -125,7 +132,7 @@ def agent_commands(
         argv += () if context.identity is None else ("--identity", context.identity.name)
         argv += (_priority_flag(context),)
         name = agent_name(agents[0]) if len(agents) == 1 else f"agents-{agents[0]}-{agents[-1]}"
-        commands.append(Command(name, argv, fds, agents))
+        commands.append(Command(name, argv, fds, agents, next(last_first) if config.agent.pinned else None))
     return tuple(commands)
 
 
@@ -136,16 +143,22 @@ def _shares(agents: int, most: int) -> list[range]:
 
 
 def crowding_warning(config: Config, agents: Sequence[int]) -> list[str]:
-    """Return what to say where more agents have processes of their own than the processors can serve in time."""
-    processors = _processors()
+    """Return what to say where processes of agents have too few processors."""
+    processors = len(usable_processors())
     processes = len(_shares(len(agents), config.swarm.agents_per_process))
+    lines = []
+    if config.agent.pinned and processes >= processors:
+        lines = [
+            f"warning: {processes} processes of agents are bound to all {processors} processors, and wait there for "
+            "router, simulator and others: without agent.pinned fewer setpoints are late"
+        ]
     if not config.sitl.enabled or (processes <= _CROWDED * processors and len(agents) <= _CROWDED_SHARED * processors):
-        return []
+        return lines
     share = -(-len(agents) // processors)
     text = f"{len(agents)} agents on {processors} processors: setpoints may be late, and nobody arms while they are"
     if len(agents) > _CROWDED_SHARED * processors:
-        return [f"warning: {text}; `swarmctl simulate` flies them on a simulated clock"]
-    return [f"warning: {text}; --set swarm.agents_per_process={share} costs half as much"]
+        return [*lines, f"warning: {text}; `swarmctl simulate` flies them on a simulated clock"]
+    return [*lines, f"warning: {text}; --set swarm.agents_per_process={share} costs half as much"]
 
 
 def sitl_command(
@@ -205,6 +218,8 @@ class Child:
         except OSError as error:
             raise StartError(f"{command.name}: {command.argv[0]} can't be started: {error}") from error
         self.pid = self.process.pid
+        if command.processor is not None:
+            bind_to_processor(self.pid, command.processor)
 
     def poll(self) -> int | None:
         """Return the exit code as a shell does (128 + signal), or None while running."""

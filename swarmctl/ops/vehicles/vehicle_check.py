@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swarmctl.check.change import Change
+from swarmctl.check.computer import priority_finding
 from swarmctl.check.parameters import Number, changes, unchangeable
 from swarmctl.check.scan.link_facts import ArmingProblem, FenceFacts, VehicleFacts
 from swarmctl.check.scan.scanner import VehicleScan, run_scans
@@ -25,8 +26,10 @@ from swarmctl.config import Config
 from swarmctl.configuration.config_warnings import warning_lines
 from swarmctl.configuration.constraints import one_place_at_two_hosts
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.ops.processes import wants_realtime
 from swarmctl.ops.vehicles.vehicle_links import VehicleLinks, open_links
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.process_priority import is_realtime_permitted
 
 if TYPE_CHECKING:
     from swarmctl.check.ground_services import GroundVehicle
@@ -86,7 +89,10 @@ def check(config: Config, options: CheckOptions) -> int:
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)  # so that started processes are ended
     with ended_cleanly, open_links(config, options.connect_s, options.agents) as opened:
         vehicles, changed = _scan(config, options, opened)
-    lines = findings(vehicles, config) + [change.finding() for change in changed if not change.done]
+    asks = wants_realtime(config, options.agents or range(config.swarm.agents))
+    lines = findings(vehicles, config)
+    lines.append(priority_finding(is_wanted=asks, is_permitted=is_realtime_permitted()))
+    lines += [change.finding() for change in changed if not change.done]
     if options.to_fly:
         lines += standing(vehicles)
     code = exit_code(vehicles, lines)

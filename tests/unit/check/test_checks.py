@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import development as mavlink
 from rich.console import Console
 
 from swarmctl.check.change import Change
+from swarmctl.check.computer import priority_finding
 from swarmctl.check.finding import SWARM, Finding, worst_first
 from swarmctl.check.parameters import changes, names_to_read, unchangeable
 from swarmctl.check.scan.link_facts import (
@@ -757,3 +758,17 @@ def test_a_terminal_shows_once_what_is_the_same_of_several_vehicles(
     shown = {tuple(row[1:]) for row in cells}
     assert {(x.topic, x.found, x.wanted, x.verdict.name.lower()) for x in lines} == shown, "nothing is lost"
     assert len(cells) < 0.7 * len(lines)
+
+
+@pytest.mark.parametrize(
+    ("is_wanted", "is_permitted", "verdict"), [(True, True, OK), (True, False, NOTE), (False, False, OK)]
+)
+def test_a_computer_that_lets_setpoints_wait_is_told_of(
+    capsys: pytest.CaptureFixture[str], is_wanted: bool, is_permitted: bool, verdict: Verdict
+) -> None:
+    finding = priority_finding(is_wanted=is_wanted, is_permitted=is_permitted)
+    assert finding.verdict is verdict
+    print_check([HEALTHY], [finding], [])
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[1].startswith("computer\treal-time priority\t")
+    assert ("rtprio" in printed) == (verdict is NOTE)

@@ -101,6 +101,36 @@ def test_a_crowd_of_processes_is_warned_of(
     assert all(share in line for line in lines)
 
 
+@pytest.mark.parametrize(
+    ("processors", "sets", "wanted"),
+    [
+        ({0, 1, 2, 5}, ("swarm.agents=6", "agent.pinned=true"), [5, 2, 1, 0, 5, 2]),
+        ({0, 1, 2, 5}, ("swarm.agents=6", "agent.pinned=true", "swarm.agents_per_process=3"), [5, 2]),
+        ({0, 1, 2, 5}, ("swarm.agents=2",), [None, None]),
+    ],
+)
+def test_processes_of_agents_are_bound_to_processors_in_turns(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, processors: set[int], sets: tuple[str, ...], wanted: list[int]
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: processors)
+    config = load(None, sets)
+    context = RunContext("run", "endpoint", tmp_path, tuple(range(config.swarm.agents)))
+    assert [command.processor for command in agent_commands(config, context, ())] == wanted
+    warned = [line for line in crowding_warning(config, context.agents) if "agent.pinned" in line]
+    assert len(warned) == (len(wanted) >= len(processors))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no other system binds")
+def test_a_bound_process_runs_on_its_processor_with_all_its_threads(tmp_path: Path) -> None:
+    script = "import os, threading; t = threading.Thread(target=lambda: print(os.sched_getaffinity(0))); t.start()"
+    mine = min(os.sched_getaffinity(0))
+    child = Child(
+        Command("x", (sys.executable, "-Sc", f"import time; time.sleep(0.2); {script}"), processor=mine), tmp_path
+    )
+    assert child.wait(60.0)
+    assert child.last_line() == f"{{{mine}}}"
+
+
 @pytest.mark.parametrize("is_wanted", [True, False])
 def test_a_recovery_has_the_priority_of_its_launch(tmp_path: Path, is_wanted: bool) -> None:
     """One agent alone would always be few enough, and compute before all that fly."""
