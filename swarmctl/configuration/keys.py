@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import inspect
 import io
-import textwrap
+import sys
 import tokenize
 import types
 import typing
@@ -173,20 +173,24 @@ def meanings(model: type[Params]) -> dict[str, str]:
     found: dict[str, str] = {}
     for owner in reversed(model.__mro__):
         if issubclass(owner, Params) and owner is not Params:
-            found |= _own_meanings(textwrap.dedent(inspect.getsource(owner)))
+            found |= _own_meanings(owner)
     return found
 
 
-def _own_meanings(source: str) -> dict[str, str]:
+def _own_meanings(model: type[Params]) -> dict[str, str]:
+    """Return the comment beside each field of a class itself.
+
+    It is looked for in the file, as from Python 3.13 on `inspect` does not find the classes that pydantic makes.
+    """
+    source = inspect.getsource(sys.modules[model.__module__])
     by_line = {
         token.start[0]: token.string.lstrip("# ").strip()
         for token in tokenize.generate_tokens(io.StringIO(source).readline)
         if token.type == tokenize.COMMENT
     }
-    (definition,) = ast.parse(source).body
-    assert isinstance(definition, ast.ClassDef)
+    definitions = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef))
     found = {}
-    for node in definition.body:
+    for node in next(one for one in definitions if one.name == model.__name__).body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
             found[node.target.id] = " ".join(by_line[line] for line in lines if line in by_line)
