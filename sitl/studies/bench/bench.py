@@ -192,8 +192,10 @@ def run(options: argparse.Namespace) -> int:
 def _run_scale(options: argparse.Namespace, solver: str, console: Console) -> list[Path]:
     """Measure how costs grow; return what was written."""
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(f"counts, {solver}", total=len(options.neighbours) + scale.SWARMS * len(options.agents))
+        counts = len(options.neighbours) + scale.SWARMS * len(options.agents) + len(options.hosts)
+        task = bar.add_task(f"counts, {solver}", total=counts)
         rows = scale.neighbour_rows(options.neighbours, solver, options.ticks, partial(bar.advance, task))
         rows += scale.agent_rows(options.agents, solver, options.ticks, partial(bar.advance, task))
+        rows += scale.host_rows(options.hosts, solver, partial(bar.advance, task))
     scale.show(rows, console)
     return scale.write(rows, options.out)

@@ -1,7 +1,7 @@
 """The command line of the `bench` verb. What measures is imported after it is read, so that `--help` is quick.
 
-`python -m sitl.studies.bench.command [--scale] [--out DIR] [--neighbours 0,1,2] [--agents 3,6] [--solver osqp]
-[--ticks N] [--no-slsqp]`
+`python -m sitl.studies.bench.command [--scale] [--out DIR] [--neighbours 0,1,2] [--agents 3,6] [--hosts 1,2]
+[--solver osqp] [--ticks N] [--no-slsqp]`
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
 MAX_NEIGHBOURS = 99
 AGENTS = (3, 6, 12, 24)
 MAX_AGENTS = 100
+HOSTS = (1, 2, 3, 4, 6)
+MAX_HOSTS = 12
 SOLVERS = ("osqp", "daqp")  # those of `control.mpc.solvers.qp`, which takes a second to import
 _WHAT = """The `bench` verb: measures the duration of an agent's tick, split into parts, for growing swarms and each
-QP solver; with --scale, how costs grow with neighbours and agents, with fitted exponents and a plot."""
+QP solver; with --scale, how costs grow with neighbours, agents and hosts, with fitted exponents and a plot."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -28,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if problem := _problem(options):
         parser.error(problem)
-    options.agents = options.agents or list(AGENTS)
+    options.agents, options.hosts = options.agents or list(AGENTS), options.hosts or list(HOSTS)
     from sitl.studies.bench.bench import run
 
     return exit_code_of(partial(run, options))
@@ -40,6 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--neighbours", metavar="K,K", type=_counts, default=list(NEIGHBOURS), help="counts, 0 to 99")
     parser.add_argument("--scale", action="store_true", help="how costs grow, with one solver: scale.json, scale.html")
     parser.add_argument("--agents", metavar="N,N", type=_agents, help="counts of --scale, 2 to 100")
+    parser.add_argument("--hosts", metavar="H,H", type=_hosts, help="counts of --scale, 1 to 12")
     parser.add_argument("--solver", action="append", choices=SOLVERS, help="repeatable; default: all installed")
     parser.add_argument("--ticks", metavar="N", type=_ticks, default=300, help="measured: ticks, and x-y problems")
     parser.add_argument("--slsqp", action=argparse.BooleanOptionalAction, help="the nonlinear baseline; default: yes")
@@ -49,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
 def _problem(options: argparse.Namespace) -> str:
     """Return which options don't go together, or ""."""
     if not options.scale:
-        return "--agents needs --scale" if options.agents else ""
+        return "--agents and --hosts need --scale" if options.agents or options.hosts else ""
     if options.slsqp is not None or len(options.solver or ()) > 1:
         return "--scale measures one solver, and not SLSQP"
     return ""
@@ -61,6 +64,10 @@ def _counts(text: str) -> list[int]:
 
 def _agents(text: str) -> list[int]:
     return _numbers(text, 2, MAX_AGENTS)
+
+
+def _hosts(text: str) -> list[int]:
+    return _numbers(text, 1, MAX_HOSTS)
 
 
 def _numbers(text: str, least: int, most: int) -> list[int]:

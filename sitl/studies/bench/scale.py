@@ -1,14 +1,15 @@
-"""`bench --scale`: how costs grow with the number of neighbours and of agents, with the fitted exponents and a plot.
+"""`bench --scale`: how costs grow with neighbours, agents and hosts, with the fitted exponents and a plot.
 
-Three questions, each with counts of its own:
+Four questions, each with counts of its own:
 
 - neighbours: the tick of one agent that has a row in its problem for each of them, as in `bench`;
 - agents: a whole swarm in lockstep, hovering 3 m apart, where each agent has rows for its two nearest
   (`separation.max_neighbours`) but hears everybody;
-- agents in groups: the same in groups of six that are out of each other's reach (`agent.path_sharing.far_hz`).
+- agents in groups: the same in groups of six that are out of each other's reach (`agent.path_sharing.far_hz`);
+- hosts: the bus alone of twelve agents, in real time, with routers and processes as on so many computers.
 
 Processor time counts all of it, the simulator included; bytes are what an agent gives to its bus, and what it hears.
-Swarms are measured for at least 2 s, a whole number of periods of their status.
+Swarms in lockstep are measured for at least 2 s, a whole number of periods of their status.
 
 An exponent is that of cost = a * count ** exponent, by least squares in logarithms: 0 is flat, 1 is linear.
 """
@@ -26,9 +27,11 @@ import numpy as np
 from markupsafe import Markup
 from rich.box import SIMPLE
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
+from rich.text import Text
 
 from sitl.lockstep import Lockstep
+from sitl.studies.bench.bus_over_hosts import bus_cost
 from sitl.studies.bench.captured import settled_garbage, times_of
 from sitl.studies.bench.output import json_rows, write_texts
 from sitl.studies.bench.ticks import get_under_way, measure_ticks, tracks
@@ -44,21 +47,33 @@ _GROUP, _GROUPS_APART_M = 6, 40.0  # two rows of three
 _ROWS = 2  # neighbours with rows in a swarm: as many at every count, from 3 agents on
 _SETTLE_STEPS = 50  # after the last agent has begun to track
 _LEAST_S, _STATUS_S = 2.0, 0.2
+_HOSTS_S = 5.0
 _SMALLEST = 2  # count that an exponent begins at: 0 has no logarithm, and 1 agent has nobody to share with
+
+
+COLUMNS = (  # p50 (p99) of ticks and ages
+    "tick [ms]",
+    "x real time",
+    "sent [B/s]",
+    "heard [B/s]",
+    "path age [ms]",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleRow:
     """One line of `scale.json`; what a question does not ask is None."""
 
-    question: str  # "neighbours", "agents" or "agents in groups"
+    question: str  # "neighbours", "agents", "agents in groups" or "hosts"
     solver: str
     count: int
-    tick_p50_ms: float  # of one agent
-    tick_p99_ms: float
+    tick_p50_ms: float | None = None  # of one agent
+    tick_p99_ms: float | None = None
     real_time_per_core: float | None = None  # flown seconds of agents, added up, in one second of a processor
     bytes_per_agent_s: float | None = None  # published on the bus
     heard_bytes_per_agent_s: float | None = None  # delivered by it
+    path_age_p50_ms: float | None = None  # when a tick takes it from the bus
+    path_age_p99_ms: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,6 +123,26 @@ def agent_rows(counts: Sequence[int], solver: str, ticks: int, on_count: Callabl
         for count in counts:
             rows.append(_swarm_row(question, swarm, count, solver, ticks))
             on_count()
+    return rows
+
+
+def host_rows(counts: Sequence[int], solver: str, on_count: Callable[[], None]) -> list[ScaleRow]:
+    """Measure the bus of a swarm on so many hosts, for each count."""
+    rows = []
+    for count in counts:
+        cost = bus_cost(count, _HOSTS_S)
+        rows.append(
+            ScaleRow(
+                question="hosts",
+                solver=solver,
+                count=count,
+                real_time_per_core=round(cost.real_time_per_core, 3),
+                heard_bytes_per_agent_s=round(cost.heard_bytes_per_agent_s, 1),
+                path_age_p50_ms=round(cost.path_age_p50_ms, 3),
+                path_age_p99_ms=round(cost.path_age_p99_ms, 3),
+            )
+        )
+        on_count()
     return rows
 
 
@@ -185,6 +220,13 @@ _SWARMS = {
 
 
 SWARMS = len(_SWARMS)  # measured for each count of agents
+_COSTS: dict[str, Callable[[ScaleRow], float | None]] = {
+    "tick [ms]": lambda row: row.tick_p50_ms,
+    "processor time for a second of one agent [s]": lambda row: row.real_time_per_core and 1.0 / row.real_time_per_core,
+    "bytes published by one agent [1/s]": lambda row: row.bytes_per_agent_s,
+    "bytes heard by one agent [1/s]": lambda row: row.heard_bytes_per_agent_s,
+    "age of paths that are heard [ms]": lambda row: row.path_age_p50_ms,
+}
 
 
 def _bus_bytes(flight: Lockstep) -> Array:
@@ -196,19 +238,12 @@ def _bus_bytes(flight: Lockstep) -> Array:
 
 def growths(rows: Sequence[ScaleRow]) -> list[Growth]:
     """Return every cost over its count, with its exponent."""
-    near = {row.count: row.tick_p50_ms for row in rows if row.question == "neighbours"}
-    found = [_growth("tick [ms]", "neighbours", near)]
-    for question in _SWARMS:
-        swarm = [row for row in rows if row.question == question]
-        spent = {row.count: 1.0 / row.real_time_per_core for row in swarm if row.real_time_per_core}
-        sent = {row.count: row.bytes_per_agent_s for row in swarm if row.bytes_per_agent_s}
-        heard = {row.count: row.heard_bytes_per_agent_s for row in swarm if row.heard_bytes_per_agent_s}
-        found += [
-            _growth("tick [ms]", question, {row.count: row.tick_p50_ms for row in swarm}),
-            _growth("processor time for a second of one agent [s]", question, spent),
-            _growth("bytes published by one agent [1/s]", question, sent),
-            _growth("bytes heard by one agent [1/s]", question, heard),
-        ]
+    found = []
+    for question in dict.fromkeys(row.question for row in rows):
+        asked = [row for row in rows if row.question == question]
+        for title, cost in _COSTS.items():
+            costs = {row.count: value for row in asked if (value := cost(row))}
+            found.append(_growth(title, question, costs))
     return [growth for growth in found if len(growth.counts)]
 
 
@@ -230,13 +265,38 @@ def fitted_power(counts: Array, costs: Array) -> tuple[float, float]:
     return math.exp(log_factor), float(exponent)
 
 
+def cells(row: ScaleRow) -> tuple[str, ...]:
+    """Return the text of each of `COLUMNS`; what was not asked for is empty."""
+    return (
+        _pair(row.tick_p50_ms, row.tick_p99_ms, 2),
+        _number(row.real_time_per_core, 1),
+        _number(row.bytes_per_agent_s, 0),
+        _number(row.heard_bytes_per_agent_s, 0),
+        _pair(row.path_age_p50_ms, row.path_age_p99_ms, 1),
+    )
+
+
+def _number(value: float | None, decimals: int) -> str:
+    return "" if value is None else f"{value:.{decimals}f}"
+
+
+def _pair(p50: float | None, p99: float | None, decimals: int) -> str:
+    return "" if p50 is None else f"{_number(p50, decimals)} ({_number(p99, decimals)})"
+
+
 def write(rows: Sequence[ScaleRow], directory: Path) -> list[Path]:
     """Write `scale.json` and `scale.html` to `directory`, which is made if necessary, and return their paths.
 
     Raises:
         StartError: it can't be written.
     """
-    page = render(__package__, "scale.html", rows=rows, charts=[_chart(growth) for growth in growths(rows)])
+    page = render(
+        __package__,
+        "scale.html",
+        columns=COLUMNS,
+        rows=[(row, cells(row)) for row in rows],
+        charts=[_chart(growth) for growth in growths(rows)],
+    )
     return write_texts({"scale.json": json_rows(rows), "scale.html": page}, directory)
 
 
@@ -251,16 +311,13 @@ def _chart(growth: Growth) -> Markup:
 
 def show(rows: Sequence[ScaleRow], console: Console) -> None:
     """Print the rows and what grows how."""
-    columns = "tick p50 (p99) [ms]", "times real time per core", "bytes per agent [1/s]", "bytes heard [1/s]"
-    table = Table("count", *columns, box=SIMPLE)
-    for row in rows:
-        table.add_row(
-            f"{row.count} {row.question}",
-            f"{row.tick_p50_ms:.2f} ({row.tick_p99_ms:.2f})",
-            "" if row.real_time_per_core is None else f"{row.real_time_per_core:.1f}",
-            "" if row.bytes_per_agent_s is None else f"{row.bytes_per_agent_s:.0f}",
-            "" if row.heard_bytes_per_agent_s is None else f"{row.heard_bytes_per_agent_s:.0f}",
-        )
-    console.print(table)
+    console.print("p50 (p99) of ticks and of ages; times real time on one processor", markup=False)
+    for question in dict.fromkeys(row.question for row in rows):
+        asked = {row.count: cells(row) for row in rows if row.question == question}
+        told = [name for place, name in enumerate(COLUMNS) if any(texts[place] for texts in asked.values())]
+        table = Table(question, *(Column(Text(name), justify="right") for name in told), box=SIMPLE)
+        for count, texts in asked.items():
+            table.add_row(f"{count}", *(text for text in texts if text))
+        console.print(table)
     for growth in growths(rows):
         console.print(growth.words, markup=False, highlight=False)

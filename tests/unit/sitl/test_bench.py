@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 from scipy import optimize
 
-from sitl.studies.bench import bench, command, formation, scale, ticks
+from sitl.studies.bench import bench, bus_over_hosts, command, formation, scale, ticks
 from sitl.studies.bench.captured import Captured, capture, circle_with_obstacle, measure_xy, tapped
 from sitl.studies.bench.formation import Formation, Neighbours, formation_config, places_m
 from sitl.studies.bench.slsqp import KEPT_M, NonlinearXy
@@ -35,6 +35,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ticks, "_WARM_UP_S", 0.1)
     monkeypatch.setattr(scale, "_SETTLE_STEPS", 5)
     monkeypatch.setattr(scale, "_LEAST_S", 0.4)
+    monkeypatch.setattr(scale, "_HOSTS_S", 0.5)
+    monkeypatch.setattr(bus_over_hosts, "_SETTLES_S", 0.5)
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +81,8 @@ def test_a_tick_without_a_plan_is_no_figure(monkeypatch: pytest.MonkeyPatch) -> 
         ["--solver", "qp"],
         ["--agents", "1", "--scale"],
         ["--agents", "101", "--scale"],
+        ["--hosts", "1,2"],
+        ["--hosts", "13", "--scale"],
         ["--agents", "3"],
         ["--scale", "--no-slsqp"],
         ["--scale", "--solver", "osqp", "--solver", "daqp"],
@@ -316,19 +320,25 @@ def test_the_exponent_of_a_power_is_found_whatever_zero_and_one_cost(exponent: f
 
 @pytest.mark.usefixtures("quick")
 def test_growth_is_measured_written_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = command.main(["--scale", "--neighbours", "2,4", "--agents", "2,4", "--ticks", "8", "--out", str(tmp_path)])
+    counts = ("--neighbours", "2,4", "--agents", "2,4", "--hosts", "2,3", "--ticks", "8")
+    code = command.main(["--scale", *counts, "--out", str(tmp_path)])
     assert code == 0
     rows = json.loads((tmp_path / "scale.json").read_text())
     assert [(row["question"], row["count"]) for row in rows] == [
         *(("neighbours", count) for count in (2, 4)),
         *(("agents", count) for count in (2, 4)),
         *(("agents in groups", count) for count in (2, 4)),
+        *(("hosts", count) for count in (2, 3)),
     ]
-    assert all(0.0 < row["tick_p50_ms"] <= row["tick_p99_ms"] for row in rows)
-    assert all(row["real_time_per_core"] > 0.0 and row["bytes_per_agent_s"] > 1000.0 for row in rows[2:])
+    assert all(0.0 < row["tick_p50_ms"] <= row["tick_p99_ms"] for row in rows[:6])
+    assert all(row["real_time_per_core"] > 0.0 for row in rows[2:])
+    assert all(row["bytes_per_agent_s"] > 1000.0 for row in rows[2:6])
+    assert all(0.0 < row["path_age_p50_ms"] <= row["path_age_p99_ms"] for row in rows[6:])
+    whole = 11 * (50 * 534 + 5 * 753)  # bytes of paths and statuses of all others
+    assert [row["heard_bytes_per_agent_s"] for row in rows[6:]] == pytest.approx([whole, whole], rel=0.3)
     said = capsys.readouterr().out
-    assert said.count("exponent") == 9 and "scale.html" in said
-    assert (tmp_path / "scale.html").read_text().count("<figure>") == 9
+    assert said.count("exponent") == 12 and "scale.html" in said
+    assert (tmp_path / "scale.html").read_text().count("<figure>") == 12
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(
