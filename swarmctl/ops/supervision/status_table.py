@@ -1,7 +1,7 @@
 """Status display of a launch: a live table on a terminal, one line per change elsewhere.
 
 The table fits 80 columns and 24 lines: a row of short cells for each agent, and below them the alerts, in whole words.
-A wider terminal has more columns.
+A wider terminal has more columns. Where it has too few lines, those agents have rows that need somebody.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import re
 import sys
 import textwrap
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TextIO
@@ -29,6 +30,8 @@ from swarmctl.telemetry.recording.event_log import EventLog
 
 REFRESH_HZ = 4.0
 _LINE = 2000  # longest printed line
+_AROUND_ROWS = 5  # lines of a terminal: title, head, and what a live table leaves free
+_OF_ALERTS = 4  # part of the lines that rows leave to alerts
 _WIDE = 117  # columns of a terminal that has room for everything
 _SILENT_S = 2.0  # without a status for so long an agent is lost to the operator
 _OPERATORS_MATTER = ("HOLD", "GOTO", "WAIT", "PILOT", "FAILSAFE", "LOST")  # whose beginning and end are lines
@@ -197,11 +200,34 @@ def status_table(agents: Sequence[AgentView], width: int = 80, height: int | Non
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for column in columns:
         table.add_column(f"{column.title}\n{column.unit}", justify=column.justify, min_width=column.width, no_wrap=True)
-    for view in agents:
+    shown, others = _chosen(agents, height)
+    for view in shown:
         table.add_row(*(Text(column.cell_of(view)) for column in columns))  # not markup: agents' texts may have "[...]"
-    room = None if height is None else max(1, height - len(agents) - 5)
-    title = Text(": ".join(word for word in (run, headline(agents)) if word), no_wrap=True, overflow="ellipsis")
-    return Group(title, table, *(Text(line) for line in _alert_lines(agents, width, room)))
+    room = None if height is None else max(1, height - len(shown) - bool(others) - _AROUND_ROWS)
+    title = _one_line(": ".join(word for word in (run, headline(agents)) if word))
+    rest = [_one_line(_summed_up(others))] if others else []
+    return Group(title, table, *rest, *(Text(line) for line in _alert_lines(agents, width, room)))
+
+
+def _chosen(agents: Sequence[AgentView], height: int | None) -> tuple[list[AgentView], list[AgentView]]:
+    """Return the agents that have rows, and the others: where not all fit, those come first that need somebody."""
+    if height is None:
+        return list(agents), []
+    most = max(1, height - _AROUND_ROWS - min(height // _OF_ALERTS, sum(bool(view.alert) for view in agents)))
+    if len(agents) <= most:
+        return list(agents), []
+    first = sorted(agents, key=lambda view: not (view.alert or view.control in _OPERATORS_MATTER))
+    return sorted(first[: most - 1], key=lambda view: view.agent), first[most - 1 :]
+
+
+def _summed_up(agents: Sequence[AgentView]) -> str:
+    """Return what agents without a row are doing."""
+    doing = Counter(f"{name_of(Phase, view.status.phase)} {view.control}" for view in agents if view.status is not None)
+    return f"{len(agents)} more: " + ", ".join(f"{count} {what}" for what, count in doing.most_common())
+
+
+def _one_line(text: str) -> Text:
+    return Text(text, no_wrap=True, overflow="ellipsis")
 
 
 def _alert_lines(agents: Sequence[AgentView], width: int, room: int | None) -> list[str]:

@@ -64,6 +64,31 @@ def rendered(agents: Sequence[AgentView], width: int, height: int | None) -> lis
     return stream.getvalue().splitlines()
 
 
+def flying(agents: int, **fields: object) -> list[AgentView]:
+    calm = {"phase": Phase.TRACK, "control": "TRACKING", "active_alert": "", **fields}
+    return [AgentView(agent=i, status=status(i, **calm)) for i in range(agents)]
+
+
+@pytest.mark.parametrize(("agents", "height"), [(50, 24), (100, 24), (50, 40), (20, 12)])
+def test_of_more_agents_than_lines_those_are_shown_that_need_somebody(agents: int, height: int) -> None:
+    views = flying(agents)
+    for needy in (views[3], views[-1]):
+        needy.note = "killed by SIGKILL"
+    views[-2].status = status(agents - 2, phase=Phase.TRACK, control="FAILSAFE", active_alert="")
+    lines = rendered(views, 80, height)
+    assert len(lines) <= height - 1, "one line is the prompt's"
+    numbers = [int(line.split()[0]) for line in lines[3:] if line.split()[1:2] == ["TRACK"]]
+    assert numbers == sorted(numbers) and {3, agents - 2, agents - 1} <= set(numbers)
+    hidden = agents - len(numbers)
+    assert f"{hidden} more: {hidden} TRACK TRACKING" in lines
+    assert sum("killed by SIGKILL" in line for line in lines) == 2, "all alerts are read"
+
+
+def test_all_agents_that_have_room_are_shown() -> None:
+    assert not [line for line in rendered(flying(18), 80, 24) if "more" in line]
+    assert [line for line in rendered(flying(20), 80, 24) if "more" in line]
+
+
 @pytest.mark.parametrize("width", [80, 116, 117, 160])
 @pytest.mark.parametrize("agents", [3, 12])
 def test_no_word_is_cut_and_agent_numbers_are_readable(agents: int, width: int) -> None:
