@@ -108,7 +108,7 @@ class Predictor:
         return self._delay_us
 
     def sent(self, now_us: int, virtual_control: Array) -> None:
-        """Remember a command, virtual_control controls (3,), that acts after the delay."""
+        """Remember a command, virtual controls (3,), that acts after the delay."""
         self._sent.append((now_us + self._delay_us, virtual_control))
 
     def clear(self) -> None:
@@ -192,7 +192,7 @@ def tilt_rate(state: VehicleState) -> Array:
 
 
 def acceleration(virtual_control: Array) -> Array:
-    """Return the acceleration (3,) NED [m/s2] of virtual_control controls (3,), gravity included (thesis 3.2)."""
+    """Return the acceleration (3,) NED [m/s2] of virtual controls (3,), gravity included (thesis 3.2)."""
     return np.array(_acceleration(*virtual_control.tolist()))
 
 

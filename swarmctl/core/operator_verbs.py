@@ -1,8 +1,8 @@
 """The operator's verbs that agents obey, in one table.
 
 A row becomes a verb of the command line with its options (`swarmctl.ops.cli`), an order that may be on the bus with its
-arguments in bounds (`swarmctl.bus.messages.json_messages`), and an entry of the handlers in
-`control.phases.state_machine`; but `exclude` is obeyed by the world model, because it is about a peer.
+arguments in bounds (`swarmctl.bus.messages.json_messages`), and what `control.phases.obeyed_orders` does; but `exclude`
+is obeyed by the world model, because it is about a peer.
 """
 
 from __future__ import annotations

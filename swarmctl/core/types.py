@@ -48,7 +48,10 @@ class Landed(enum.IntEnum):
 
 
 class Phase(enum.IntEnum):
-    """The phase of an agent's mission; it only moves forward."""
+    """The phase of an agent's mission.
+
+    It moves forward, but for a vehicle that an operator resumes in the air in LAND: that goes back to GOTO_LAND.
+    """
 
     CONNECT = 0  # no vehicle state yet, or its link is not set up
     STANDBY = 1  # vehicle seen, waiting for health and for every peer
@@ -260,4 +263,4 @@ class Health:
     battery_01: float  # charge that remains; negative: unknown
     link_lost_01: float  # share of the newest seconds in which the state was stale
     dead_reckoning_s: float  # for how long the estimate has been going on without GPS
-    pilot_override: bool  # a pilot or the autopilot timing over, until an operator resumes
+    pilot_override: bool  # a pilot or the autopilot has taken over, until an operator resumes

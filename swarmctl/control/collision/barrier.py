@@ -155,7 +155,7 @@ class Barrier:
         *,
         bodies: Sequence[Body],
     ) -> Array | None:
-        """Return the virtual_control controls (3,) to fly in place of `virtual_control`; None when those are safe.
+        """Return the virtual controls (3,) to fly in place of `virtual_control`; None when those are safe.
 
         Args:
             virtual_control: (3,) wanted u_x, u_y and thrust over mass [m/s2].

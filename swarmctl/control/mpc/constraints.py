@@ -16,7 +16,7 @@ from swarmctl.core.types import Array
 
 _SLACK_SCALE_M = 0.1  # unit of slack variables, so that they are about 1 like all others
 _REACHABLE_01 = 0.998  # share of the reachable displacement that replaces an end out of reach
-_FACE_SPACING_S = 0.2  # likewise; a path can't bend much in between
+_FACE_SPACING_S = 0.2  # between the rows of a face: a path can't bend much in between
 _USUAL_S = 1.0  # time that braking takes, for the scale of its rows
 _ASKED_01 = 0.97  # share of the reachable displacement that a face may ask for: with 0.9 plans put braking off
 _TANGENT_GAP_M = 0.05  # missed between tangents of the way to stop: less than a certificate allows

@@ -1,4 +1,4 @@
-"""Parameters of deadlock recovery, apart from it: who only reads a configuration need not load scipy's graphs."""
+"""Parameters of deadlock recovery."""
 
 from __future__ import annotations
 
