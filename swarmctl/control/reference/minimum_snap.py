@@ -62,7 +62,8 @@ def fastest_minimum_snap(points: Array, speed_m_s: float, accel_m_s2: float) -> 
     lengths_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
     spans_s = lengths_m / speed_m_s + np.sqrt(lengths_m / accel_m_s2)
     times_s = np.concatenate([[0.0], np.cumsum(spans_s)])
-    return stretched(minimum_snap(times_s, points), stretch(minimum_snap(times_s, points), speed_m_s, accel_m_s2))
+    flight = minimum_snap(times_s, points)
+    return stretched(flight, stretch(flight, speed_m_s, accel_m_s2))
 
 
 def stretch(flight: PiecewisePolynomial, speed_m_s: float, accel_m_s2: float) -> float:

@@ -75,7 +75,7 @@ class CsvParams(SharedReference):
         return lambda t_s: sign * flight.sample(t_s)[0][:, 3] + offset_rad
 
     def ends_s(self, place: Place) -> float:
-        return float(self._flight(place).knots_s[-1])
+        return self._flight(place).end_s
 
     def problems(self, agents: int) -> Iterator[str]:
         if len(self.tables) not in (1, agents):

@@ -52,7 +52,7 @@ class SkybrushParams(MissionKind):
         return sampled
 
     def ends_s(self, place: Place) -> float:
-        return float(_flight(self.trajectories[place.agent]).knots_s[-1]) - self.begin_s
+        return _flight(self.trajectories[place.agent]).end_s - self.begin_s
 
     def problems(self, agents: int) -> Iterator[str]:
         if not self.file and not self.trajectories:

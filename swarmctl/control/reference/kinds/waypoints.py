@@ -48,7 +48,7 @@ class WaypointsParams(SharedReference):
         return Goal(pos_ned_m=np.array(self._list(place).points_ned_m[-1]))
 
     def ends_s(self, place: Place) -> float:
-        return float(self._flight(place).knots_s[-1])
+        return self._flight(place).end_s
 
     def problems(self, agents: int) -> Iterator[str]:
         if len(self.lists) not in (1, agents):
