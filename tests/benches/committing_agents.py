@@ -41,6 +41,12 @@ def committing(agent: int, *, max_keep_outs: int, separation: SeparationParams =
     return Commitments(agent, params, planner)
 
 
+def grid_steps(agent: Commitments) -> int:
+    """Return the number of steps that keep-outs in `Situation.others` cover."""
+    assert isinstance(agent._planner, TrajectoryPlanner)
+    return agent._planner.steps
+
+
 @dataclass(kw_only=True)
 class Network:
     """A network with seeded delays and losses, and an outage."""

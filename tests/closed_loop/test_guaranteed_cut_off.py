@@ -44,7 +44,7 @@ def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
             began_us.append(flight.lockstep.clock.now_us())
             flight.lockstep.hub.fail()
         policies = [agent._separation for agent in flight._agents if agent is not None]
-        counts.append(sum(p.coordination.counts.committed for p in policies if isinstance(p, Guaranteed)))
+        counts.append(sum(p._coordination.counts.committed for p in policies if isinstance(p, Guaranteed)))
 
     while not began_us or flight.lockstep.clock.now_us() < began_us[0] + 2_000_000:
         watched()
@@ -119,7 +119,7 @@ def two_of_six_cut_off(evasions_shown: float = math.inf) -> TrialFlight:
 
 def evasions(flight: TrialFlight) -> int:
     policies = [agent._separation for agent in flight._agents if agent is not None]
-    return sum(policy.coordination.counts.evasive for policy in policies if isinstance(policy, Guaranteed))
+    return sum(policy._coordination.counts.evasive for policy in policies if isinstance(policy, Guaranteed))
 
 
 def test_nobody_leaves_a_commitment_for_a_conflict_before_peers_that_are_merely_cut_off() -> None:

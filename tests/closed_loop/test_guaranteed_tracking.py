@@ -62,7 +62,7 @@ class HeldUp:
                 fastest_m_s = max(fastest_m_s, float(np.linalg.norm(flight.world.plant.vel_ned_m_s[:, 0])))
         (agent,) = flight.agents
         assert agent is not None and isinstance(agent._separation, Guaranteed)
-        return agent._separation.coordination.worst_tracking_m, fastest_m_s
+        return agent._separation._coordination.worst_tracking_m, fastest_m_s
 
 
 def test_a_vehicle_that_is_held_up_slows_and_does_not_chase_what_it_had_committed_to() -> None:
@@ -82,7 +82,7 @@ def test_negative_control_commitments_that_go_on_in_time_are_chased(monkeypatch:
 def off_now_m(flight: Lockstep) -> float:
     """Return how far the agents of a flight that goes on have been off what they had committed to, at most."""
     policies = [agent._separation for agent in flight.agents if agent is not None]
-    return max(policy.coordination.worst_tracking_m for policy in policies if isinstance(policy, Guaranteed))
+    return max(policy._coordination.worst_tracking_m for policy in policies if isinstance(policy, Guaranteed))
 
 
 def worst_tracking_m(flight: Lockstep) -> float:

@@ -35,7 +35,7 @@ def frozen(sets: tuple[str, ...], agents: set[int], at_s: float) -> Flight:
 def evasions(running: Lockstep) -> int:
     """Return how many commitments have been changed without acknowledgement."""
     policies = [agent._separation for agent in running.agents if agent is not None]
-    return sum(policy.coordination.counts.evasive for policy in policies if isinstance(policy, Guaranteed))
+    return sum(policy._coordination.counts.evasive for policy in policies if isinstance(policy, Guaranteed))
 
 
 @pytest.mark.parametrize("at_s", [0.6, 1.0])

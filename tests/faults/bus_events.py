@@ -47,7 +47,7 @@ def commits_nothing(agents: Sequence[int], from_s: float, to_s: float) -> dict[s
 
     def holds(scene: Scene) -> bool:
         policies = [scene.agent(i)._separation for i in agents]
-        committed = sum(p.coordination.counts.committed for p in policies if isinstance(p, Guaranteed))
+        committed = sum(p._coordination.counts.committed for p in policies if isinstance(p, Guaranteed))
         if scene.since_s <= from_s:
             scene.notes["committed"] = committed
         return not from_s < scene.since_s <= to_s or committed == scene.notes["committed"]

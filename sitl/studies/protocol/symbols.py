@@ -64,7 +64,7 @@ class SymbolicPlanner:
 
     def __init__(self, here: str, wanted: str, doubts: bool = False) -> None:
         self._here, self._wanted, self._doubts = here, wanted, doubts
-        self.dt_us, self.steps = _DT_US, 1
+        self.dt_us = _DT_US
 
     def proposal(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """See `Planner`."""

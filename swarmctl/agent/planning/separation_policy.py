@@ -134,11 +134,6 @@ class Guaranteed:
         self._state_age = StateAge()
 
     @property
-    def coordination(self) -> Coordination:
-        """Return this agent's part in the protocol, for its counts."""
-        return self._coordination
-
-    @property
     def commits_refused(self) -> int | None:
         """Return the number of proposals withdrawn or expired."""
         return self._coordination.counts.withdrawn + self._coordination.counts.expired

@@ -111,7 +111,6 @@ class Planner(Protocol):
     """
 
     dt_us: int
-    steps: int
 
     def proposal(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """Return a trajectory that leaves `committed` at `now.begin_us`, clear of everything known; None if none is."""
@@ -353,16 +352,6 @@ class Commitments:
     def lead_us(self) -> int:
         """Return the time between making a proposal and leaving the committed trajectory for it [us]."""
         return round(self._lead_s * 1e6)
-
-    @property
-    def steps(self) -> int:
-        """Return the number of time steps that keep-outs in `Situation.others` cover."""
-        return self._planner.steps
-
-    @property
-    def dt_us(self) -> int:
-        """Return the step of that grid [us]."""
-        return self._planner.dt_us
 
     def _replace(self, committed: Trajectory) -> None:
         self.committed, self.proposal = committed, None

@@ -52,7 +52,7 @@ class Amid(Bench):
         """Return where the autopilot of the silent vehicle flies it: past the agent."""
         if not agents or not self.is_coming:
             return KeepOuts()
-        separation, steps = SeparationParams(), self.coordination._commitments.steps + 1
+        separation, steps = SeparationParams(), self.coordination._non_participants._steps + 1
         way = HERE + np.array([[max(-0.4, 1.6 - 0.1 * k), 0.0, 0.0] for k in range(steps)])
         return KeepOuts([keep_out_of_commitment(way, agent, separation, separation.budget) for agent in agents])
 

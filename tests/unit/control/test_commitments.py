@@ -19,7 +19,7 @@ from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array, Sampled
 from tests import builders
-from tests.benches.committing_agents import HARD_MIN_M, UTC_US, Crowd, Network, committing
+from tests.benches.committing_agents import HARD_MIN_M, UTC_US, Crowd, Network, committing, grid_steps
 
 
 def test_of_two_proposals_in_conflict_the_earlier_one_is_flown() -> None:
@@ -54,7 +54,7 @@ def message_of(agent: Commitments, number: int) -> dict[int, TrajectoryMessage]:
 
 
 def wall(x_m: float, agent: Commitments) -> KeepOut:
-    return builders.keep_out(pos_ned_m=np.tile([x_m, 0.0, -2.0], (agent.steps + 1, 1)), priority_id=-1)
+    return builders.keep_out(pos_ned_m=np.tile([x_m, 0.0, -2.0], (grid_steps(agent) + 1, 1)), priority_id=-1)
 
 
 def test_an_evasion_is_found_by_the_peer_it_conflicts_with() -> None:
@@ -108,7 +108,7 @@ def test_an_agent_at_rest_evades_what_approaches() -> None:
     """A stop would change nothing: it rests already."""
     agent = committing(0, max_keep_outs=2)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
-    times_s = 0.1 * np.arange(agent.steps + 1)
+    times_s = 0.1 * np.arange(grid_steps(agent) + 1)
     coming = np.stack([2.5 - 1.0 * times_s, 0.3 + 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
     agent.evade(
         builders.situation(
@@ -135,7 +135,7 @@ def test_an_agent_that_is_enclosed_evades_upwards(column: bool, passes_m: float)
         i: builders.trajectory_message(agent=i, sent_utc_us=UTC_US, committed=resting(np.array(side), UTC_US, 100_000))
         for i, side in enumerate(sides, start=1)
     }
-    times_s = 0.1 * np.arange(agent.steps + 1)
+    times_s = 0.1 * np.arange(grid_steps(agent) + 1)
     coming = np.stack([3.5 - 1.0 * times_s, 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
     agent.evade(
         builders.situation(
@@ -191,7 +191,7 @@ def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes:
     agent = committing(0, max_keep_outs=5, separation=small)
     to_north = quintic_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, accel_m_s2=1.0)
     agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), brake_m_s2=1.5)
-    wall = posts(0.8, (0.3, 0.6, 0.9, 1.2), agent.steps)
+    wall = posts(0.8, (0.3, 0.6, 0.9, 1.2), grid_steps(agent))
     path = along(np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]]))
     agent.propose(
         builders.situation(
@@ -215,7 +215,7 @@ def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: py
     agent = committing(0, max_keep_outs=3, separation=small)
     here = np.array([2.716, 2.764, -2.0])
     agent.begin(here, np.zeros(3), UTC_US)
-    wall = posts(3.0, (2.802, 2.502, 2.202), agent.steps)
+    wall = posts(3.0, (2.802, 2.502, 2.202), grid_steps(agent))
     path = along(np.array([here[:2], [2.77, 3.14], [3.21, 3.25], [4.19, 3.06]]))
     agent.propose(
         builders.situation(

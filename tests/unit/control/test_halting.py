@@ -16,7 +16,7 @@ from swarmctl.core.trajectory import Trajectory, ending_at_rest
 from swarmctl.core.trajectory_message import Proposal
 from swarmctl.core.types import Array
 from tests import builders
-from tests.benches.committing_agents import HARD_MIN_M, UTC_US, committing
+from tests.benches.committing_agents import HARD_MIN_M, UTC_US, committing, grid_steps
 
 STEP_US, SPEED_M_S, HEIGHT_M = 100_000, 1.5, 2.0
 BRAKE_M_S2 = CommitParams().brake_m_s2
@@ -98,9 +98,9 @@ def before_a_vehicle(
         desired=DesiredReference(at_goal),
         peers={1: builders.trajectory_message(agent=1, committed=peer, proposal=made)},
     )
-    where = met if met.ndim == 2 else np.tile(met, (agent.steps + 1, 1))
+    where = met if met.ndim == 2 else np.tile(met, (grid_steps(agent) + 1, 1))
     vehicle = builders.keep_out(
-        pos_ned_m=where[: agent.steps + 1], radius_m=HARD_MIN_M, hard_min_distance_m=HARD_MIN_M, priority_id=1
+        pos_ned_m=where[: grid_steps(agent) + 1], radius_m=HARD_MIN_M, hard_min_distance_m=HARD_MIN_M, priority_id=1
     )
     agent.stop_before(now, KeepOuts([vehicle]), leaves=leaves)
     return agent
