@@ -92,14 +92,16 @@ class SeparationMode:
 
     policy: Callable[[AgentSetup, Ports, WorldModel], SeparationPolicy]
     controller: Callable[[AgentSetup], ControllerParams]
-    proposals: Callable[[AgentSetup, Stopwatch], TrajectoryPlanner | None]  # what the policy plans by itself
+    trajectory_planner: Callable[[AgentSetup, Stopwatch], TrajectoryPlanner | None]  # None: it plans no trajectories
 
 
 SEPARATION_MODES = {  # by `separation.mode`
     "best_effort": SeparationMode(
-        policy=_best_effort, controller=lambda setup: setup.controller, proposals=lambda *_: None
+        policy=_best_effort, controller=lambda setup: setup.controller, trajectory_planner=lambda *_: None
     ),
-    "guaranteed": SeparationMode(policy=_guaranteed, controller=_following, proposals=_make_trajectory_planner),
+    "guaranteed": SeparationMode(
+        policy=_guaranteed, controller=_following, trajectory_planner=_make_trajectory_planner
+    ),
 }
 
 
@@ -157,7 +159,7 @@ def make_rehearsal(setup: AgentSetup, ports: Ports, world_model: WorldModel) -> 
         params = params.model_copy(update={"kind": "dmpc"})
     return Rehearsal(
         make_controller(params, _controller_setup(setup, ports.stopwatch_ns)),
-        mode.proposals(setup, ports.stopwatch_ns),
+        mode.trajectory_planner(setup, ports.stopwatch_ns),
         round(1e6 * setup.params.commit.period_s),
         world_model,
     )

@@ -86,7 +86,11 @@ class CommitmentPublisher:
         attentive = [agent for agent in newest if agent not in unheard]
         asking = {agent: newest[agent] for agent in attentive}
         if for_all:
-            asking |= {agent: i for agent, i in newest.items() if i.proposal is not None and i.proposal.asks_far}
+            asking |= {
+                agent: message
+                for agent, message in newest.items()
+                if message.proposal is not None and message.proposal.asks_far
+            }
         acknowledged = acknowledgements(asking, refused)
         if not (for_all or is_committed or acknowledged):
             return  # who waits on the ground has nothing to say to anybody in particular

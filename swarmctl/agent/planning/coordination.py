@@ -98,7 +98,7 @@ class Coordination:
         )
         self._spared: frozenset[int] = frozenset()  # peers whose acknowledgement of the proposal is not required
         self._hears = self._peers  # every message of these
-        self._others_m_s = 0.0  # speed at which somebody else flies the vehicle
+        self._flown_by_others_m_s = 0.0  # speed at which a pilot or the autopilot flies the vehicle
         self._params = params
         self._non_participants = NonParticipants(world_model, separation, dt_us=planner.dt_us, steps=planner.steps)
         self._is_committed = False
@@ -191,7 +191,7 @@ class Coordination:
         """
         commitments = self._commitments
         if not self._is_committed:
-            self._is_committed, self._others_m_s = True, 0.0
+            self._is_committed, self._flown_by_others_m_s = True, 0.0
             if self._begun_us is None:
                 self._begun_without = self._world_model.statuses.excused
             self._begun_us = utc_us
@@ -204,7 +204,8 @@ class Coordination:
         self.cut_off = self._why_cut_off(utc_us, asked & near if commitments.proposal is None else asked)
         self._unanswered.update(commitments.proposal, asked, newest)
         if commitments.proposal is not None:
-            commitments.update(utc_us, {a: i for a, i in newest.items() if a not in self._spared}, asked)
+            compared = {agent: message for agent, message in newest.items() if agent not in self._spared}
+            commitments.update(utc_us, compared, asked)
         relied_on = self._relied_on(utc_us, known, required)
         begin_us = utc_us + commitments.lead_us
         now = Situation(
@@ -212,7 +213,7 @@ class Coordination:
             begin_us=utc_us,
             desired=self._tracking.paced(desired, begin_us),
             peers={agent: known[agent] for agent in relied_on},
-            others=self._others(utc_us, state, phase, relied_on, self._entered_now),
+            others=self._other_keep_outs(utc_us, state, phase, relied_on, self._entered_now),
             disturbance_ned_m_s2=disturbance_ned_m_s2,
         )
         commitments.evade(now)
@@ -221,17 +222,18 @@ class Coordination:
         self.alert = self._why_slow(unsure, utc_us)
         if commitments.is_due(utc_us) and self._tracking.grip < Grip.STOPPED and not unsure:
             heard = (relied_on & required) - self._absent()
-            others = self._others(begin_us, state, phase, heard, self._entered_ahead)
+            others = self._other_keep_outs(begin_us, state, phase, heard, self._entered_ahead)
             commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
             self._spare(utc_us)
-            commitments.keep_clear_of(
-                {agent: i for agent, i in newest.items() if agent not in known and agent not in self._spared}, utc_us
-            )
+            left_out = [agent for agent in newest if agent not in known and agent not in self._spared]
+            commitments.keep_clear_of({agent: newest[agent] for agent in left_out}, utc_us)
 
     def _near_messages(self) -> Mapping[int, TrajectoryMessage]:
         """Return the newest messages of the peers that are not far, to which alone trajectories can come close."""
         newest, near = self._peer_trajectories.newest, self._far_peers.near
-        return newest if len(near) == len(self._peers) else {agent: i for agent, i in newest.items() if agent in near}
+        if len(near) == len(self._peers):
+            return newest
+        return {agent: message for agent, message in newest.items() if agent in near}
 
     def _spare(self, utc_us: int) -> None:
         """Choose the peers whose acknowledgement of a new proposal is not required."""
@@ -295,7 +297,8 @@ class Coordination:
             self.committed_peers, self.lost_peer_keep_outs, self.cut_off, self.alert = {}, [], "", ""
             self._note("commitments", **asdict(self.counts), worst_tracking_m=self.worst_tracking_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
-        self._others_m_s = math.inf if state is None else _FASTER_01 * float(np.linalg.norm(state.vel_ned_m_s))
+        speed_m_s = math.inf if state is None else float(np.linalg.norm(state.vel_ned_m_s))
+        self._flown_by_others_m_s = _FASTER_01 * speed_m_s
 
     def sample_committed(self, t_utc_us: Times) -> tuple[Array, Array]:
         """Return the positions and velocities, (M, 3) NED each, to fly at times (M,)."""
@@ -325,8 +328,8 @@ class Coordination:
             reach=self._far_peers.reach(
                 commitments.trajectories,
                 away_m=commitments.late_m(utc_us),
-                speed_m_s=self._others_m_s,
-                stops_m=self._params.stop_m(self._others_m_s),
+                speed_m_s=self._flown_by_others_m_s,
+                stops_m=self._params.stop_m(self._flown_by_others_m_s),
             ),
             refused=self._ended | exclusions.promised,
         )
@@ -377,7 +380,7 @@ class Coordination:
         silent = [a for a in required if min(silence_us(a, utc_us), utc_us - begun_us) > _CUT_OFF_US]
         return f"cut off from {_names(silent)}" if silent else ""
 
-    def _others(
+    def _other_keep_outs(
         self, t0_utc_us: int, state: VehicleState, phase: Phase, without: Set[int], encounters: Encounters
     ) -> KeepOuts:
         """Return keep-outs of obstacles and of peers but those in `without`, for a plan that begins at `t0_utc_us`."""

@@ -25,15 +25,19 @@ class Rehearsal:
 
     Args:
         controller: kept for rehearsals, as flights must not depend on how long a vehicle has stood.
-        proposals: likewise, with guaranteed separation; None: the controller itself keeps clear of peers.
+        trajectory_planner: likewise, with guaranteed separation; None: the controller itself keeps clear of peers.
         period_us: time between two proposals.
         world_model: what to keep clear of.
     """
 
     def __init__(
-        self, controller: Controller, proposals: TrajectoryPlanner | None, period_us: int, world_model: WorldModel
+        self,
+        controller: Controller,
+        trajectory_planner: TrajectoryPlanner | None,
+        period_us: int,
+        world_model: WorldModel,
     ) -> None:
-        self._controller, self._proposals, self._world_model = controller, proposals, world_model
+        self._controller, self._trajectory_planner, self._world_model = controller, trajectory_planner, world_model
         self._period_us, self._next_us = period_us, 0
 
     def plan(self, utc_us: int, start: Start, top_ned_m: Array, keep_outs: KeepOuts) -> None:
@@ -48,8 +52,8 @@ class Rehearsal:
         at_top = replace(start, pos_ned_m=top_ned_m, vel_ned_m_s=np.zeros(3))
         points = self._controller.longest + 1
         hover = Reference(np.tile(top_ned_m, (points, 1)), np.zeros((points, 3)), 0.0)
-        if self._proposals is not None:
-            self._propose(self._proposals, utc_us, top_ned_m)
+        if self._trajectory_planner is not None:
+            self._propose(self._trajectory_planner, utc_us, top_ned_m)
             keep_outs = NO_KEEP_OUTS
         guess_ned_m = np.tile(top_ned_m, (self._controller.steps + 1, 1))
         self._controller.plan(

@@ -143,9 +143,9 @@ class PathPublisher:
             self._stop_judge.forget()
             self._flown = flown, now_us + self._delay_us
             t0_us, dt_us, pos = flown.t0_us, flown.dt_us, flown.pos_ned_m
-            heard_us = self._ports.autopilot.unheard_since_us(now_us)
-            if heard_us is not None:
-                pos, apart_m = self._unheard(state, flown, heard_us)
+            unheard_since_us = self._ports.autopilot.unheard_since_us(now_us)
+            if unheard_since_us is not None:
+                pos, apart_m = self._unheard(state, flown, unheard_since_us)
                 margin_m += apart_m
                 accel_ned_m_s2 = None  # of a setpoint that may not have arrived
         else:
@@ -188,7 +188,7 @@ class PathPublisher:
         heard = predict_after_setpoints(plan, last_us, self._ahead_s(t0_us, last_us), lag_s=self._lag_s, **limits)
         return _middle(heard, deaf, self._dt_us)
 
-    def _unheard(self, state: VehicleState, flown: Plan, heard_us: int) -> tuple[Array, float]:
+    def _unheard(self, state: VehicleState, flown: Plan, unheard_since_us: int) -> tuple[Array, float]:
         """Return positions (N, 3), NED [m], of a vehicle that misses setpoints, and how far it may be off [m].
 
         It keeps its attitude until it hears one or its autopilot takes over. The middle between that way and the plan
@@ -197,7 +197,7 @@ class PathPublisher:
         keeps_s, coasts_s = self._ports.autopilot.setpoint_loss_s, self._ports.autopilot.landing_delay_s
         if keeps_s is None or coasts_s is None:
             return flown.pos_ned_m, 0.0
-        kept_s = (state.t_us - heard_us) * 1e-6
+        kept_s = (state.t_us - unheard_since_us) * 1e-6
         ahead_s = grid(len(flown.pos_ned_m) - 1) * (flown.dt_us * 1e-6) + (flown.t0_us - state.t_us) * 1e-6
         deaf = predict_without_setpoints(
             state,

@@ -211,7 +211,8 @@ class Commitments:
             self._set_lead(2.0 * self._lead_s)
             return
         known = [message.committed for message in peers.values() if message.is_committed]
-        known += [i.proposal.trajectory for i in peers.values() if i.proposal and i.proposal.order < mine.order]
+        proposals = [message.proposal for message in peers.values() if message.proposal is not None]
+        known += [proposal.trajectory for proposal in proposals if proposal.order < mine.order]
         new = [trajectory for trajectory in known if id(trajectory) not in self._cleared]
         if self._planner.conflicts(mine.trajectory, utc_us, new):
             self.proposal = None
@@ -368,7 +369,11 @@ def acknowledgements(peers: Mapping[int, TrajectoryMessage], without: Set[int]) 
         peers: newest message of each peer, as given to `Commitments.update` before.
         without: peers that take no part any more, or are promised to be excluded.
     """
-    return {agent: i.proposal.number for agent, i in peers.items() if i.proposal is not None and agent not in without}
+    return {
+        agent: message.proposal.number
+        for agent, message in peers.items()
+        if message.proposal is not None and agent not in without
+    }
 
 
 def _quantile(values: Iterable[float], share_01: float) -> float:

@@ -233,8 +233,8 @@ class FarPeers:
     def _radius_m(self, place: _Place, utc_us: int) -> float:
         """Return the radius of the ball around where a peer was, with room for the error of its clock."""
         error_us, reach = place.message.committed.clock_error_us, place.message.reach
-        ahead_us = min(max(0, utc_us - place.sent_utc_us) + error_us, FAR_LEASE_US) + error_us
-        return reach.speed_m_s * 1e-6 * ahead_us + reach.stretch_m + place.message.tube_m
+        age_us = min(max(0, utc_us - place.sent_utc_us) + error_us, FAR_LEASE_US) + error_us
+        return reach.speed_m_s * 1e-6 * age_us + reach.stretch_m + place.message.tube_m
 
 
 def _extent_of(trajectory: Trajectory) -> _Extent:

@@ -37,9 +37,7 @@ _HALT_DELAY_S = 0.6  # a stop along the own places that begins so much later mus
 _HALTS_AFTER_S = (0.4, 0.2, 0.0)
 _UNSURE_M = 0.3  # of where vehicles are after 2 s without setpoints, as measured
 _BRAKING_TAIL_S = 2.0  # part of the final braking for which keep-outs are told; `lasting` predicts them beyond it
-_OUTWARD_TOLERANCE_M = (
-    0.01  # farther out of the flight volume allowed to proposals of a vehicle that is outside already
-)
+_OUTWARD_TOLERANCE_M = 0.01  # by which proposals of a vehicle outside of the flight volume may go farther out
 _APPROACH_TOLERANCE_M = 0.001  # approach allowed to trajectories that are too close already
 
 
@@ -92,9 +90,8 @@ class TrajectoryPlanner:
             ),
         )
         self.dt_us = round(params.dt_s * 1e6)
-        self.steps = self._mpc.steps + math.ceil(
-            _BRAKING_TAIL_S / params.dt_s
-        )  # grid of `Situation.others`: plan and final braking
+        # grid of `Situation.others`: plan and final braking
+        self.steps = self._mpc.steps + math.ceil(_BRAKING_TAIL_S / params.dt_s)
 
     def proposal(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """Return a trajectory that leaves `committed` at `now.begin_us`, clear of everything known; None if none is."""
@@ -118,7 +115,10 @@ class TrajectoryPlanner:
         known = now.followed
 
         def margin_m(trajectory: Trajectory) -> float:
-            return min(self._clearance_m(trajectory, now), self._margin_m(trajectory, now.utc_us, known))
+            return min(
+                self._margin_to_keep_outs_m(trajectory, now),
+                self._margin_to_trajectories_m(trajectory, now.utc_us, known),
+            )
 
         least_m = margin_m(committed) + _MIN_GAIN_M
         best, best_order = None, (False, least_m)
@@ -133,16 +133,16 @@ class TrajectoryPlanner:
 
     def is_clear(self, trajectory: Trajectory, now: Situation) -> bool:
         """Tell whether a trajectory keeps the hard minimum distance to every keep-out in `now.others`."""
-        return self._clearance_m(trajectory, now) >= 0.0
+        return self._margin_to_keep_outs_m(trajectory, now) >= 0.0
 
     def conflicts(self, trajectory: Trajectory, utc_us: int, known: Sequence[Trajectory], spare_m: float = 0.0) -> bool:
         """Tell whether a trajectory comes too close to any of `known` between `utc_us` and when all are at rest."""
-        return not self._margin_m(trajectory, utc_us, known, spare_m) >= 0.0
+        return not self._margin_to_trajectories_m(trajectory, utc_us, known, spare_m) >= 0.0
 
     def may_halt_later(self, committed: Trajectory, now: Situation) -> bool:
         """Tell whether a stop along the own places that begins `_HALT_DELAY_S` later is still clear of keep-outs."""
         later = self._halting_candidates(committed, now, _HALT_DELAY_S)
-        return any(self._clearance_m(candidate, now) >= _UNSURE_M for candidate in later)
+        return any(self._margin_to_keep_outs_m(candidate, now) >= _UNSURE_M for candidate in later)
 
     def halting(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """Return `committed`, stopped along its own places, which others do not pass; None if that gains nothing.
@@ -150,10 +150,10 @@ class TrajectoryPlanner:
         See `swarmctl.control.commit.halting`. The latest and softest is returned that is clear, or else the one that
         keeps most distance.
         """
-        best, best_m = None, self._clearance_m(committed, now) + _MIN_GAIN_M
+        best, best_m = None, self._margin_to_keep_outs_m(committed, now) + _MIN_GAIN_M
         for after_s in _HALTS_AFTER_S:
             for candidate in self._halting_candidates(committed, now, after_s):
-                found_m = self._clearance_m(candidate, now)
+                found_m = self._margin_to_keep_outs_m(candidate, now)
                 if found_m >= _UNSURE_M:
                     return candidate
                 if found_m > best_m:
@@ -304,7 +304,7 @@ class TrajectoryPlanner:
         allowed = np.minimum(0.0, (present @ normals - kept).min(axis=0) - _OUTWARD_TOLERANCE_M)
         return bool(((trajectory.pos_ned_m @ normals - kept).min(axis=0) >= allowed).all())
 
-    def _clearance_m(self, trajectory: Trajectory, now: Situation) -> float:
+    def _margin_to_keep_outs_m(self, trajectory: Trajectory, now: Situation) -> float:
         """Return the smallest margin [m] of a trajectory to `now.others`, until it is at rest however fast it is."""
         beyond = max(0, -(-(trajectory.end_utc_us - now.begin_us) // self.dt_us) - self.steps)
         others = now.others
@@ -313,9 +313,10 @@ class TrajectoryPlanner:
         times = now.begin_us + np.arange(self.steps + beyond + 1) * self.dt_us
         return certify(trajectory.sample(times)[0], others, 0)
 
-    def _margin_m(
+    def _margin_to_trajectories_m(
         self, trajectory: Trajectory, utc_us: int, known: Sequence[Trajectory], spare_m: float = 0.0
     ) -> float:
+        """Return the smallest margin [m] of a trajectory to those of `known`, from `utc_us` until all are at rest."""
         if not known:
             return math.inf
         end_us = max(trajectory.end_utc_us, *(other.end_utc_us for other in known))

@@ -186,7 +186,7 @@ def test_the_certificate_against_a_stale_peer_has_all_of_its_margin(bench: Bench
     bench.fly(0.5, each=bench.send)
     bench.fly(1.0)
     utc_us, params = bench.clock.utc_us(), SeparationParams()
-    (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set(), Encounters())
+    (kept,) = bench.coordination._other_keep_outs(utc_us, bench.state, Phase.TRACK, set(), Encounters())
     (control,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
     assert control.hard_min_distance_m == params.budget.hard_min_distance_m, "which would not grow with age"
     assert kept.hard_min_distance_m > params.budget.planned_m + 0.5
@@ -199,7 +199,7 @@ def test_an_encounter_with_who_does_not_take_part_is_measured_from_where_it_bega
     def came_m(north_m: float) -> float | None:
         bench.fly(0.1, each=lambda: bench.send(HERE + np.array([north_m, 0.0, 0.0])))
         encounters = bench.coordination._entered_now
-        (kept,) = bench.coordination._others(bench.clock.utc_us(), bench.state, Phase.TRACK, set(), encounters)
+        (kept,) = bench.coordination._other_keep_outs(bench.clock.utc_us(), bench.state, Phase.TRACK, set(), encounters)
         return kept.entered_m
 
     bench.fly(0.2, each=bench.send)
