@@ -99,7 +99,7 @@ def _set_in_flight(
     for event in events:
         source = str(event.get("source"))
         for agent in agents if event.get("event") == "mission_changed" else ():
-            if source == f"agent-{agent}":
+            if source == agent_name(agent):
                 goal = event.get("goal_ned_m")
                 numbers = [finite(part) for part in goal] if isinstance(goal, list) else []
                 known = [number for number in numbers if number is not None]

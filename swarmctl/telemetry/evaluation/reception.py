@@ -6,19 +6,21 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from swarmctl.bus.refusals import BOOT, FORGED, FUTURE, IDENTITY, LATE, MALFORMED, SEQUENCE, UNKNOWN_PEER, UNSEALED
+from swarmctl.bus.topics import OBSTACLES
 from swarmctl.core.json_safe import finite
 
 _ALLOWED = {  # refusals by one agent for each peer and topic; other reasons are normal for a network or a restart
-    "boot": 0,
-    "sequence": 0,
-    "identity": 0,
-    "unsealed": 0,
-    "forged": 0,
-    "unknown_peer": 0,
-    "malformed": 50,  # the paths of one second
-    "future": 50,
+    BOOT: 0,
+    SEQUENCE: 0,
+    IDENTITY: 0,
+    UNSEALED: 0,
+    FORGED: 0,
+    UNKNOWN_PEER: 0,
+    MALFORMED: 50,  # the paths of one second
+    FUTURE: 50,
 }
-_ALLOWED_LISTS = {"malformed": 5, "future": 5, "late": 5}  # of obstacles, repeated once a second, valid for a minute
+_ALLOWED_LISTS = {MALFORMED: 5, FUTURE: 5, LATE: 5}  # of obstacles, repeated once a second, valid for a minute
 
 
 def refused_peers(events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -30,7 +32,7 @@ def refused_peers(events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             counts[sender, topic, reason][str(event.get("source"))] = event["count"]
     found: dict[str, list[tuple[str, str, int, list[str]]]] = defaultdict(list)
     for (sender, topic, reason), by in sorted(counts.items()):
-        allowed = _ALLOWED | _ALLOWED_LISTS if topic == "obstacles" else _ALLOWED
+        allowed = _ALLOWED | _ALLOWED_LISTS if topic == OBSTACLES.name else _ALLOWED
         if told := {agent: count for agent, count in by.items() if count > allowed.get(reason, count)}:
             found[sender].append((topic, reason, sum(told.values()), sorted(told)))
     for sender, rows in found.items():

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
+from swarmctl.bus.bus import agent_name
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.json_safe import finite, json_safe
 from swarmctl.core.obstacle import Obstacle
@@ -31,7 +32,7 @@ from swarmctl.telemetry.evaluation.run_counts import (
     own_controllers,
     solver_counts,
 )
-from swarmctl.telemetry.evaluation.station_clock import ClockedTicks, by_station_clock, seen_late
+from swarmctl.telemetry.evaluation.station_clock import ClockedTicks, by_station_clock, seen_late, started
 from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
@@ -183,8 +184,7 @@ class _MissionClock:
 
 def _agents_here(run: RunData, rules: Rules) -> Sequence[int]:
     """Return the agents that flew from the computer that recorded the run: all, unless its launch says otherwise."""
-    started = next((event for event in run.events if event.get("event") == "started"), {})
-    listed = started.get("agents")
+    listed = started(run.events).get("agents")
     of_swarm = range(rules.agents)
     return [agent for agent in of_swarm if agent in listed] if isinstance(listed, list) and listed else of_swarm
 
@@ -361,7 +361,7 @@ def _cut_short(tracked_s: Mapping[int, float], rules: Rules, events: Sequence[Ma
     changed = [event for event in events if event.get("event") == "mission_changed"]
     asked_s = {event.get("source"): event.get("duration_s") for event in changed}
     for agent, seconds in tracked_s.items():
-        wanted_s = asked_s.get(f"agent-{agent}", rules.duration_s)
+        wanted_s = asked_s.get(agent_name(agent), rules.duration_s)
         if isinstance(wanted_s, int | float) and seconds < wanted_s - _DURATION_SLACK_S:
             yield f"mission time {seconds:.1f} s of agent {agent} below {wanted_s:g} s"
 

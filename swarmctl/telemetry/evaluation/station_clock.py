@@ -103,7 +103,7 @@ def seen_late(clocked: ClockedTicks, at_s: Callable[[float], float]) -> list[dic
 
 def is_of_station(events: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether a station has recorded a run, by its events."""
-    return _started(events).get("agents") == []
+    return started(events).get("agents") == []
 
 
 def by_newest_clock(rows: NDArray[np.void], most_us: int) -> tuple[NDArray[np.void], bool]:
@@ -137,10 +137,10 @@ def by_station_clock(
         events: of the run.
         cut: agents whose clocks are not known, as only ticks of the newest of several are there.
     """
-    started = _started(events)
     if not is_of_station(events):
         return ClockedTicks(ticks=dict(ticks), ahead_s=None)
-    own_utc_us, own_t_us = started.get("utc_us"), started.get("t_us")
+    began = started(events)
+    own_utc_us, own_t_us = began.get("utc_us"), began.get("t_us")
     shifts_us = dict[int, int]()
     if isinstance(own_utc_us, int) and isinstance(own_t_us, int):
         shifts_us = {agent: behind_us + own_utc_us - own_t_us for agent, behind_us in _least_us(events).items()}
@@ -171,7 +171,8 @@ def corrected_text(clocks: Sequence[Mapping[str, Any]] | None) -> str:
     return ", ".join([*said, *([f"{len(far) - _SHOWN} more"] if len(far) > _SHOWN else [])])
 
 
-def _started(events: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+def started(events: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Return the event with which a recording begins; an empty one where it is missing."""
     return next((event for event in events if event.get("event") == "started"), {})
 
 

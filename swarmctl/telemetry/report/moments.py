@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.bus.bus import agent_name
 from swarmctl.core.json_safe import finite
 from swarmctl.core.operator_verbs import EXCLUDE, GOTO, MISSION, POINT
 from swarmctl.core.text import point_text
@@ -41,7 +42,7 @@ def moments(
         time_of: returns the mission time [s] of an event; None: it does not say.
         seconds: returns the mission times (T,) [s] of ticks.
     """
-    sources = {f"agent-{agent}": agent for agent in ticks}
+    sources = {agent_name(agent): agent for agent in ticks}
     found: list[tuple[float, str, int]] = []
     for event in events:
         agent, at_s = sources.get(str(event.get("source"))), time_of(event)
