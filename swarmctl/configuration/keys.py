@@ -23,7 +23,7 @@ from pydantic.fields import FieldInfo
 
 from swarmctl.config import Config
 from swarmctl.core.discovery.own import BuiltInOrOwn
-from swarmctl.core.params import Params
+from swarmctl.core.params import Params, model_in
 
 _SIGNS = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
 _WORDS = {bool: "boolean", int: "integer", float: "number", str: "text"}
@@ -158,13 +158,6 @@ def _bare(annotation: Any) -> Any:
 def is_optional(annotation: Any) -> bool:
     """Return whether a field may be left unset."""
     return type(None) in typing.get_args(annotation)
-
-
-def model_in(annotation: Any) -> type[Params] | None:
-    """Return the parameter class that an annotation is or contains."""
-    if isinstance(annotation, type) and issubclass(annotation, Params):
-        return annotation
-    return next((found for argument in typing.get_args(annotation) if (found := model_in(argument))), None)
 
 
 @cache

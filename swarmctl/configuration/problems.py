@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from swarmctl.configuration.source import shown
-from swarmctl.core.params import OTHER_KEY, Params
+from swarmctl.core.params import OTHER_KEY, Params, model_in
 from swarmctl.core.text import counted, printable
 from swarmctl.errors import ConfigError
 
@@ -119,7 +119,7 @@ def all_keys(model: Any, prefix: str) -> Iterator[str]:
     """Yield the dotted keys of a class of parameters and of its sections, each after `prefix`."""
     for name, field in model.model_fields.items():
         yield f"{prefix}{name}"
-        inner = _model_of(field.annotation)
+        inner = model_in(field.annotation)
         if inner is not None:
             yield from all_keys(inner, f"{prefix}{name}.")
 
@@ -133,22 +133,12 @@ def _field_at(location: Sequence[str], root: type[Params]) -> Any:
         field = getattr(model, "model_fields", {}).get(part)
         if field is None:
             return None
-        model = _model_of(field.annotation)
+        model = model_in(field.annotation)
     return field
 
 
-def _model_of(annotation: Any) -> Any:
-    if isinstance(annotation, type) and issubclass(annotation, Params):
-        return annotation
-    for argument in getattr(annotation, "__args__", ()):
-        found = _model_of(argument)
-        if found is not None:
-            return found
-    return None
-
-
 def _keys_at(location: Sequence[str], root: type[Params]) -> list[str]:
-    model = root if not location else _model_of(getattr(_field_at(location, root), "annotation", None))
+    model = root if not location else model_in(getattr(_field_at(location, root), "annotation", None))
     return list(getattr(model, "model_fields", {}))
 
 

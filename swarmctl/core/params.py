@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
@@ -59,6 +59,13 @@ def with_sections(sections: Mapping[str, type[Params]]) -> Callable[[type[P]], t
         )
 
     return extended
+
+
+def model_in(annotation: Any) -> type[Params] | None:
+    """Return the class of parameters that the annotation of a field is or contains."""
+    if isinstance(annotation, type) and issubclass(annotation, Params):
+        return annotation
+    return next((found for argument in get_args(annotation) if (found := model_in(argument))), None)
 
 
 FARTHEST_M = 1e6  # of anything from the shared origin, along any axis

@@ -13,8 +13,8 @@ import msgspec
 
 from swarmctl.built_in_configs import EXAMPLES, built_in_files
 from swarmctl.config import Config
-from swarmctl.configuration.keys import Key, Section, meanings, model_in, sections, value_text
-from swarmctl.core.params import Params
+from swarmctl.configuration.keys import Key, Section, meanings, sections, value_text
+from swarmctl.core.params import Params, model_in
 from swarmctl.errors import ConfigError
 
 DEFAULTS = "defaults"  # name of the file of all keys
