@@ -21,7 +21,7 @@ from swarmctl.control.commit.reach import FarPeers
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import resting
 from swarmctl.core.trajectory_message import ANYWHERE, Exclusions, Proposal

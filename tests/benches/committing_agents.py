@@ -14,7 +14,7 @@ from swarmctl.control.commit.protocol import Commitments, acknowledgements
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.reference.quintic import quintic_to
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.trajectory_message import TrajectoryMessage

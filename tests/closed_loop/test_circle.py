@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from swarmctl.control.mpc import swarm_mpc
+from swarmctl.control.mpc import attempts
 from swarmctl.core.types import Landed, Mode, Phase, PlanStatus
 from tests.closed_loop.conftest import FINE, Flight, Fly, closer_than, mission_t_s
 
@@ -131,5 +131,5 @@ def test_twelve_agents_that_close_in_on_one_point_keep_their_distance(fly: Fly) 
 
 @pytest.mark.usefixtures("configured_starts")
 def test_negative_control_twelve_agents_with_one_attempt_come_closer(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(swarm_mpc, "_relaxed", lambda separation: iter(()))
+    monkeypatch.setattr(attempts, "_relaxed", lambda separation: iter(()))
     assert closing_in(fly, "separation.approach_01=0").separation_m() < 0.85

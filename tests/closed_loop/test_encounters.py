@@ -7,7 +7,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.control.collision.encounters import Encounters
-from swarmctl.control.mpc import swarm_mpc
+from swarmctl.control.mpc import attempts
 from swarmctl.core.obstacle import Obstacle
 from tests.closed_loop.conftest import fly_now, mission_t_s
 
@@ -22,7 +22,7 @@ def closest_m(monkeypatch: pytest.MonkeyPatch) -> float:
 
     Each plan comes less than 2 cm closer over its horizon of 0.8 s.
     """
-    monkeypatch.setattr(swarm_mpc, "half_spaces", lambda *_, **__: None)
+    monkeypatch.setattr(attempts, "half_spaces", lambda *_, **__: None)
     centers: list[np.ndarray] = []
 
     def appear(running: Lockstep) -> None:

@@ -13,8 +13,7 @@ from pymavlink.dialects.v20 import development as dialect
 from sitl.lockstep import Lockstep
 from swarmctl.agent.sensing import world_model
 from swarmctl.bus.peers.paths import PeerPaths
-from swarmctl.control.mpc import judgement
-from swarmctl.control.mpc import swarm_mpc as mpc
+from swarmctl.control.mpc import attempts, judgement
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from swarmctl.mavlink.codec import Codec
 from tests.benches.broken_solver import break_solver
@@ -247,7 +246,7 @@ def test_others_keep_clear_of_an_agent_without_a_solver(fly: Fly) -> None:
 
 def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     """The QP has no half-spaces and the safety filter is off: only the certifier, which is separate code, remains."""
-    monkeypatch.setattr(mpc, "half_spaces", lambda *_, **__: None)
+    monkeypatch.setattr(attempts, "half_spaces", lambda *_, **__: None)
     unfiltered = (AIR, "agent.barrier.enabled=false")
     certified = fly("mission.duration_s=8", *unfiltered, until=Lockstep.mission_is_over).separation_m()
     monkeypatch.setattr(judgement, "certify", lambda *_, **__: 1.0)

@@ -29,9 +29,10 @@ from swarmctl.config import Config, load
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
 from swarmctl.control.mpc.controller_setup import ControllerSetup
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.solvers.qp import QpParams, installed_solvers
-from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
+from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 from swarmctl.core.types import Array, Plan
 
 Mask = NDArray[np.bool_]

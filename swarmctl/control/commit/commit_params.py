@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.swarm_mpc import AxisWeights, MpcParams
+from swarmctl.control.mpc.mpc_params import AxisWeights, MpcParams
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 

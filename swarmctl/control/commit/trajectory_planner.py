@@ -18,8 +18,9 @@ from swarmctl.control.commit.halting import halted, places_apart_m
 from swarmctl.control.commit.situation import Situation, with_run_up
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.controller_setup import ControllerSetup
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem, Start
-from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
+from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 from swarmctl.control.reference.approach import Approach
 from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.flight_volume import FlightVolume

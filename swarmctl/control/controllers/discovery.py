@@ -15,7 +15,7 @@ from swarmctl.control.controllers.guard import Guard
 from swarmctl.control.controllers.kind import Controller, ControllerKind
 from swarmctl.control.controllers.own import GROUP, OwnController
 from swarmctl.control.mpc.controller_setup import ControllerSetup
-from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.core.discovery.declared import declared
 from swarmctl.core.discovery.own import BuiltInOrOwn, OwnError, in_words, own_class
 from swarmctl.core.params import Params, with_sections

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from swarmctl.control.controllers.kind import ControllerKind
-from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
+from swarmctl.control.mpc.mpc_params import MpcParams
+from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 
 DMPC = ControllerKind(name="dmpc", section="mpc", params=MpcParams, make=SwarmMpc)

@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from swarmctl.control.controllers.kind import ControllerKind
 from swarmctl.control.mpc.joint_mpc import JointMpc
-from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.control.mpc.mpc_params import MpcParams
 
 DMPC3 = ControllerKind(name="dmpc3", section="mpc", params=MpcParams, make=JointMpc)

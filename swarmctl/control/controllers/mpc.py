@@ -6,8 +6,9 @@ from dataclasses import replace
 
 from swarmctl.control.controllers.kind import ControllerKind
 from swarmctl.control.mpc.controller_setup import ControllerSetup
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
+from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 from swarmctl.core.types import Plan
 
 

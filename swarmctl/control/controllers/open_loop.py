@@ -6,8 +6,8 @@ import numpy as np
 
 from swarmctl.control.controllers.kind import ControllerKind
 from swarmctl.control.mpc.controller_setup import ControllerSetup
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.types import Plan, PlanStatus
 
 

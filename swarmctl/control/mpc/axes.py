@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.control.lag import Lag
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.types import Array
 
 Terminal = Literal["none", "position", "position_velocity", "region"]
@@ -167,3 +168,12 @@ class AxesSolution:
     residual_m: float
     terminal_gap_m: float
     solve_us: float  # inside the QP solver
+
+
+def faces_along(volume: FlightVolume | None, axes: slice) -> Faces | None:
+    """Return those faces of a volume that limit positions along `axes` of NED, as plans keep them; None without any."""
+    if volume is None:
+        return None
+    normals = volume.normals_ned[:, axes]
+    limits = normals.any(axis=1)
+    return Faces(normals=normals[limits], offsets_m=volume.planned_m[limits], brakes_m_s2=volume.brakes_m_s2[limits])

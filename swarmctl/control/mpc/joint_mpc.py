@@ -14,13 +14,14 @@ from functools import partial
 
 import numpy as np
 
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces, Penalties
+from swarmctl.control.mpc.attempts import first_guess, planned_clear
+from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces, Penalties, faces_along
 from swarmctl.control.mpc.condensed import CondensedMpc
 from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.judgement import judged
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.sized_mpc import SizedMpc
-from swarmctl.control.mpc.swarm_mpc import MpcParams, faces_along, first_guess, near_half_spaces, planned
 from swarmctl.core.frames import GRAVITY_NED_M_S2
 from swarmctl.core.types import Array, Plan
 
@@ -56,16 +57,8 @@ class JointMpc:
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
         guess = first_guess(problem, self._params.dt_s, self.steps)
-        near = partial(
-            near_half_spaces,
-            problem=problem,
-            guess_ned_m=guess,
-            axes=3,
-            max_keep_outs=self._setup.max_keep_outs,
-            dt_s=self._params.dt_s,
-            own_priority_id=self._setup.agent,
-        )
-        return planned(near, partial(self._plan, problem), self._setup.separation, self._setup.stopwatch_ns)
+        plan = partial(self._plan, problem)
+        return planned_clear(problem, guess, plan, axes=3, dt_s=self._params.dt_s, setup=self._setup)
 
     def reset(self) -> None:
         """Keep all: only a warm start outlasts a tick."""

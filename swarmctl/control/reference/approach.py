@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.reference.approach import Approach
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array

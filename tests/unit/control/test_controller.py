@@ -14,8 +14,8 @@ from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.controllers.discovery import CONTROLLERS, ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.controllers.pid import PidParams
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 from tests import builders
 

@@ -11,7 +11,7 @@ from swarmctl.control.commit.commit_params import CommitParams, interpolation_ma
 from swarmctl.control.commit.situation import DesiredReference
 from swarmctl.control.commit.trajectory_planner import TrajectoryPlanner
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting, stopping
 from swarmctl.core.types import Array, PredictedPath

@@ -15,9 +15,10 @@ from swarmctl.control.collision.separation import SeparationParams, certify
 from swarmctl.control.model import acceleration
 from swarmctl.control.mpc.axes import Terminal
 from swarmctl.control.mpc.joint_mpc import JointMpc
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.solvers.qp import QpParams
-from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
+from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 from tests import builders
 

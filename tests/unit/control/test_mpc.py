@@ -12,11 +12,13 @@ from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.collision.separation import SeparationParams, certify
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.model import VehicleModelParams, acceleration
+from swarmctl.control.mpc.attempts import closest_keep_outs
 from swarmctl.control.mpc.axes import AxesSolution
 from swarmctl.control.mpc.judgement import RESIDUAL_LIMIT_M
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.solvers.qp import QpParams
-from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc, closest_keep_outs
+from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 from swarmctl.control.rollout import ModelledVehicle
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 from tests import builders

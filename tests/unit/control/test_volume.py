@@ -15,8 +15,8 @@ from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.controllers.own import OwnController
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc import judgement, swarm_mpc
+from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem, Start
-from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.control.reference.landing_places import Taken, landing_place_ned_m
 from swarmctl.control.reference.shortest_path import shortest_path
 from swarmctl.control.rollout import ModelledVehicle
