@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from sitl.plant.vehicle import Array
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
+from swarmctl.core.types import Array
 
 
 def limited(north: float, east: float, limit: float) -> tuple[float, float]:

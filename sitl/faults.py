@@ -15,8 +15,8 @@ import numpy as np
 from sitl.net.lossy import LinkDirection, LossyLink
 from sitl.plant.estimator import Estimator
 from sitl.plant.physics import Physics
-from sitl.plant.vehicle import Array
 from sitl.plant.wind import Gust, WindStep
+from swarmctl.core.types import Array
 from swarmctl.simulator_config import EVERY_VEHICLE, FaultParams
 
 Undo = Callable[[], None]

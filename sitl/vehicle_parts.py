@@ -14,8 +14,8 @@ from sitl.net.mavlink_values import Severity
 from sitl.net.signing import SigningRules
 from sitl.plant.imu import Imu
 from sitl.plant.sensors import Estimate, LocalOrigin
-from sitl.plant.vehicle import Array, Plant
-from swarmctl.core.types import FlightMode, Landed
+from sitl.plant.vehicle import Plant
+from swarmctl.core.types import Array, FlightMode, Landed
 from swarmctl.mavlink.transport import Transport
 from swarmctl.simulator_config import SimulatorConfig
 

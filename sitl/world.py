@@ -22,10 +22,10 @@ from sitl.plant.estimator import ESTIMATORS, Estimator
 from sitl.plant.imu import Imu
 from sitl.plant.physics import Physics, outfitted
 from sitl.plant.sensors import FULL, local_origin
-from sitl.plant.vehicle import Array, Plant
+from sitl.plant.vehicle import Plant
 from sitl.vehicle_parts import IDLE, Commander, MavlinkInterface, SimulatedVehicle
 from swarmctl.core.recorded.records import TRUTH_DTYPE
-from swarmctl.core.types import FlightMode, GeoOrigin
+from swarmctl.core.types import Array, FlightMode, GeoOrigin
 from swarmctl.mavlink.signing.signature import SigningKey
 from swarmctl.mavlink.transport import Transport
 from swarmctl.simulator_config import SimulatorConfig

@@ -35,9 +35,8 @@ from sitl.arducopter.return_home import ReturnHome, ReturnStage
 from sitl.boot import Boot
 from sitl.net.mavlink_values import Result, Severity
 from sitl.plant.sensors import Estimate, LocalOrigin
-from sitl.plant.vehicle import Array
 from sitl.vehicle_parts import IDLE, Command
-from swarmctl.core.types import FlightMode, Landed
+from swarmctl.core.types import Array, FlightMode, Landed
 
 BRAKE_M_S2 = 7.5  # largest deceleration of BRAKE
 FORCE_ARM, FORCE_DISARM = 2989.0, 21196.0  # p2 of ARM/DISARM

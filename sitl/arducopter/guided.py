@@ -12,8 +12,8 @@ import numpy as np
 from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
 from sitl.plant.sensors import Estimate
-from sitl.plant.vehicle import Array
 from swarmctl.core.frames import euler_from_quat, quat_from_euler
+from swarmctl.core.types import Array
 
 MASK_RATES, MASK_NO_THRUST, MASK_NO_ATTITUDE = 7, 64, 128
 OPTION_THRUST = 8  # GUID_OPTIONS: the thrust field is a thrust

@@ -13,8 +13,8 @@ from sitl.acceleration import attitude_for, limited
 from sitl.arducopter.parameters import CopterParameters
 from sitl.arducopter.shaped_stop import ShapedStop, Xy
 from sitl.plant.sensors import Estimate
-from sitl.plant.vehicle import Array
 from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.types import Array
 
 LEASH_M = 1.0  # limit of the shaped height's lead over the vehicle
 Z_I_1_S2 = 2.0  # in place of PSC_ACCZ_I

@@ -8,7 +8,7 @@ import math
 from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
 from sitl.plant.sensors import Estimate
-from sitl.plant.vehicle import Array
+from swarmctl.core.types import Array
 
 CLIMBED_M = 0.2
 ARRIVED_M = 0.5

@@ -15,8 +15,8 @@ import numpy as np
 
 from sitl.plant.airframes import Preset
 from sitl.plant.rates import RateLoop
-from sitl.plant.vehicle import Array
 from swarmctl.core.frames import euler_from_quat
+from swarmctl.core.types import Array
 
 _TURN_RAD = 2.0 * math.pi
 _LEFT, _RIGHT = np.repeat(np.arange(4), 4), np.tile(np.arange(4), 4)  # factors of all products of two quaternions

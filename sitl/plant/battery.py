@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from sitl.plant.airframes import Preset
-from sitl.plant.vehicle import Array
+from swarmctl.core.types import Array
 from swarmctl.simulator_config import BatteryParams
 
 _AIR_KG_M3 = 1.225

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from sitl.plant.attitude import Sensed
 from sitl.plant.sensors import FULL, Estimate, Power
-from sitl.plant.vehicle import Array, Plant
+from sitl.plant.vehicle import Plant
+from swarmctl.core.types import Array
 
 _BLOCK = 50  # steps of random numbers drawn at a time
 _WHITE = 9  # random numbers per step and vehicle for the white noise on position, velocity and attitude

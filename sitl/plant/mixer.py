@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sitl.plant.airframes import Preset
-from swarmctl.core.frames import Array
+from swarmctl.core.types import Array
 
 YAW_SIGN = np.array([-1.0, 1.0, -1.0, 1.0])  # of each rotor's yaw torque
 

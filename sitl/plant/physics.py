@@ -14,8 +14,9 @@ from sitl.plant.attitude import AttitudeLoop
 from sitl.plant.battery import Battery
 from sitl.plant.estimator import Estimator
 from sitl.plant.sensors import Power
-from sitl.plant.vehicle import Array, Plant
+from sitl.plant.vehicle import Plant
 from sitl.plant.wind import Air
+from swarmctl.core.types import Array
 from swarmctl.simulator_config import SimulatorParams
 
 

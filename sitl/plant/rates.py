@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sitl.plant.vehicle import Array, Mask
+from sitl.plant.vehicle import Mask
+from swarmctl.core.types import Array
 
 _INTEGRAL_1_S = 1.5  # of the rate loop, over its proportional gain
 _WINDUP_RAD_S = 1.0

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pymap3d
 
-from sitl.plant.vehicle import Array
-from swarmctl.core.types import GeoOrigin
+from swarmctl.core.types import Array, GeoOrigin
 
 _SEMI_MAJOR_M = 6378137.0
 _ECCENTRICITY2 = 6.69437999014e-3  # WGS-84

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from sitl.plant.airframes import Preset
 from sitl.plant.mixer import YAW_SIGN, Mixer
 from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.types import Array
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 RATE_LIMIT_RAD_S = 60.0  # keeps a tumbling vehicle finite under an explicit integrator; no controlled flight comes near

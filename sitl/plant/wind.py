@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sitl.plant.vehicle import Array
+from swarmctl.core.types import Array
 from swarmctl.simulator_config import WindParams
 
 _FOOT_M = 0.3048

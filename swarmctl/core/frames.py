@@ -9,13 +9,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+
+from swarmctl.core.types import Array
 
 GRAVITY_M_S2 = 9.81
 GRAVITY_NED_M_S2 = np.array([0.0, 0.0, GRAVITY_M_S2])
 GRAVITY_NED_M_S2.flags.writeable = False
-
-Array = NDArray[np.float64]
 
 
 def quat_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:

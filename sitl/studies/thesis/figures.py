@@ -15,8 +15,9 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from sitl.studies.thesis.trace import Array, Trace
+from sitl.studies.thesis.trace import Trace
 from swarmctl.core.closest_pair import closest_pair_m
+from swarmctl.core.types import Array
 from swarmctl.telemetry.palette import LIMIT_RGB, SUM_RGB, agent_rgb, css
 from swarmctl.telemetry.report.charts import (
     REFERENCE_STYLE,

@@ -12,10 +12,10 @@ import numpy as np
 from sitl.lockstep import Lockstep
 from sitl.plant.airframes import PRESETS
 from sitl.plant.attitude import THESIS_SAMPLE_S
-from sitl.studies.thesis.trace import Array, Trace
+from sitl.studies.thesis.trace import Trace
 from swarmctl.config import Config
 from swarmctl.core.frames import euler_from_quat
-from swarmctl.core.types import PlanStatus
+from swarmctl.core.types import Array, PlanStatus
 
 PHYSICS_HZ = round(1.0 / THESIS_SAMPLE_S)
 

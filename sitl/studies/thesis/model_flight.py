@@ -15,7 +15,7 @@ import numpy as np
 from sitl.plant.airframes import PRESETS
 from sitl.plant.attitude import THESIS_GAINS, THESIS_SAMPLE_S, ThesisAttitude
 from sitl.plant.vehicle import Plant
-from sitl.studies.thesis.trace import Array, Trace
+from sitl.studies.thesis.trace import Trace
 from swarmctl.config import Config
 from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.collision.separation import keep_out_of_obstacle, keep_out_of_peer, visible
@@ -30,6 +30,7 @@ from swarmctl.control.reference.mission import MissionReference
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.frames import GRAVITY_M_S2, euler_from_quat
 from swarmctl.core.types import (
+    Array,
     AttitudeSetpoint,
     FlightMode,
     Landed,

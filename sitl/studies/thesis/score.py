@@ -7,8 +7,9 @@ from itertools import combinations
 
 import numpy as np
 
-from sitl.studies.thesis.trace import Array, Trace
+from sitl.studies.thesis.trace import Trace
 from swarmctl.core.closest_pair import closest_pair_m
+from swarmctl.core.types import Array
 from swarmctl.telemetry.evaluation.referee import STEADY_AFTER_S
 
 

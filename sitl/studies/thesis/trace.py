@@ -6,12 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.types import Array
 
-Array = NDArray[np.float64]
 Path = Literal["plant", "full"]  # plant: model only; full: full MAVLink loop
 Beside = Literal["beaten", "equal", "worse", "too close"]  # see `verdicts.MEANING`
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from swarmctl.core.clock import SimClock
 from swarmctl.core.frames import (
-    Array,
     body_z_ned,
     euler_from_quat,
     quat_from_body_z,
@@ -20,6 +19,7 @@ from swarmctl.core.frames import (
     quat_of_tilt,
     rotate_to_ned,
 )
+from swarmctl.core.types import Array
 
 RAD = math.pi / 180.0
 tilts = st.floats(-1.4, 1.4)

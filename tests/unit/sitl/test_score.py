@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from sitl.studies.thesis import score
-from sitl.studies.thesis.trace import Array, Row, Trace
+from sitl.studies.thesis.trace import Row, Trace
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.types import Array
 from swarmctl.telemetry.evaluation.referee import STEADY_AFTER_S
 
 DT_S = 0.02
