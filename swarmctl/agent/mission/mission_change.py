@@ -89,8 +89,8 @@ class MissionChange:
         reference = MissionReference(mission, setup.starts_ned_m, setup.agent, budget.planned_m)
         limits = FlightLimits(
             duration_s=mission.duration_s,
-            apart_m=budget.planned_m,
-            downwash=setup.separation.downwash,
+            apart_m=0.0,  # whether those of a whole swarm stay apart is checked where the order comes from
+            downwash=1.0,
             ground_z_m=ground_z_m,
             ground="the place of the take-off",
             volume=setup.volume,
