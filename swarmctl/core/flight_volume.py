@@ -99,7 +99,7 @@ class FlightVolume:
         assert params.floor_z_m is not None and params.ceiling_z_m is not None
         corners = np.array(params.corners_ne_m)
         along = np.roll(corners, -1, axis=0) - corners
-        inward = np.column_stack([-along[:, 1], along[:, 0]]) * (1.0 if _area_m2(corners) > 0.0 else -1.0)
+        inward = np.column_stack([-along[:, 1], along[:, 0]]) * (1.0 if _twice_area_m2(corners) > 0.0 else -1.0)
         inward /= np.linalg.norm(inward, axis=1)[:, None]
         self.params, self.sides = params, len(corners)
         self.normals_ned = np.zeros((self.sides + 2, 3))
@@ -172,7 +172,7 @@ class FlightVolume:
         return f"{place} is {beyond_m:.2f} m outside of the flight volume less {kept} ({self.face(where)})"
 
 
-def _area_m2(corners: Array) -> float:
+def _twice_area_m2(corners: Array) -> float:
     """Return twice the area of a polygon with corners (K, 2), positive from north to east."""
     north, east = corners.T
     return float((north * np.roll(east, -1) - np.roll(north, -1) * east).sum())

@@ -115,10 +115,10 @@ class TelemetryPublisher:
         self,
         record: TickRecord,
         mission: MissionState,
-        without: Collection[int],
+        excused: Collection[int],
         accepted: Sequence[PredictedPath | StatusMessage],
     ) -> None:
-        """Hand a record to the sink and the bus, and a status where one is due, with the peers not waited for.
+        """Hand a record to the sink and the bus, and a status where one is due, with the peers that are excused.
 
         The sink alone is told what the tick has received, `accepted` messages of peers among it.
         """
@@ -129,7 +129,7 @@ class TelemetryPublisher:
         self._bus.publish(topics.TICK, pack_tick(row, record.flown))
         if record.t_us - self._status_us >= _STATUS_EVERY_US:
             self._status_us = record.t_us
-            self._bus.publish(topics.STATUS, encode_message(self._status(record, mission, without)))
+            self._bus.publish(topics.STATUS, encode_message(self._status(record, mission, excused)))
 
     def _received(self, t_us: int, accepted: Sequence[PredictedPath | StatusMessage]) -> bytes:
         rows = frame_rows(t_us, self._agent, self._autopilot.arrived_us)
@@ -168,7 +168,7 @@ class TelemetryPublisher:
         ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.near()]
         return peers, obstacles, max(ages_ms, default=math.nan)
 
-    def _status(self, record: TickRecord, mission: MissionState, without: Collection[int]) -> StatusMessage:
+    def _status(self, record: TickRecord, mission: MissionState, excused: Collection[int]) -> StatusMessage:
         state, reference, error_m = record.state, record.reference, math.nan
         health, received_us, alert = self._autopilot.health, self._autopilot.received_us, self.active_alert
         if state is not None and reference is not None:
@@ -208,7 +208,7 @@ class TelemetryPublisher:
             alert_age_s=-1.0 if alert is None else (record.t_us - alert.since_us) * 1e-6,
             uses_commitments=self._uses_commitments,
             utc_us=record.utc_us,
-            without=tuple(sorted(without)),
+            without=tuple(sorted(excused)),
             code=self._code,
             lags_us={} if self._uses_commitments else dict(self._lags_us(record.utc_us)),
         )

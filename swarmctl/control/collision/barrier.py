@@ -312,7 +312,6 @@ class _Responses:
 
 def _responses(lag: Lag | None, drag_1_s: float, for_s: float) -> _Responses:
     after = partial(_moved, lag, drag_1_s, for_s)
-
     return _Responses(
         of_velocity=after(vel=1.0),
         of_accel=after(accel=1.0),
@@ -333,6 +332,7 @@ def _moved(
     vel: float = 0.0,
     accel: float = 0.0,
 ) -> tuple[float, float]:
+    """Return displacement and velocity along one axis after a time, from these initial values and held inputs."""
     pos = 0.0
     if lag is None:
         return pos, vel

@@ -76,12 +76,12 @@ def half_spaces(
 def _stops(
     known: KeepOuts, last: Array, others: Array, vel_m_s: Array, *, dt_s: float, stop_m_s2: float
 ) -> tuple[Array, Array]:
-    """Return how long braking takes towards each keep-out at the end, and how far each moves away meanwhile, (slots,).
+    """Return (keep-outs,) how long braking towards each takes at the end, and how far it moves away meanwhile.
 
     Args:
         known: the keep-outs.
-        last: (slots, axes) normals at the last step.
-        others: (slots, Hp, axes) places of the keep-outs.
+        last: (keep-outs, axes) normals at the last step.
+        others: (keep-outs, Hp, axes) places of the keep-outs.
         vel_m_s: (axes,) own velocity at the first point.
         dt_s: time between points.
         stop_m_s2: see `SeparationParams`.
@@ -96,7 +96,7 @@ def _stops(
 
 
 def _part_coincident(normal: Array, distance: Array, has_priority: Sequence[bool]) -> None:
-    """Set normals (slots, Hp, axes) where distances (slots, Hp) have no direction: sideways, by priority."""
+    """Set normals (keep-outs, Hp, axes) where distances (keep-outs, Hp) have no direction: sideways, by priority."""
     sides = np.zeros((len(normal), 1, normal.shape[2]))
     sides[:, 0, 0] = np.where(has_priority, 1.0, -1.0)
     np.copyto(normal, sides, where=(distance < _TINY_M)[:, :, None])
@@ -105,12 +105,12 @@ def _part_coincident(normal: Array, distance: Array, has_priority: Sequence[bool
 def _largest_turns(
     normal: Array, to_goal: Array, obstacles: Sequence[int], stuck_01: float, params: SeparationParams
 ) -> Array:
-    """Return the largest turn (slots, Hp) of each normal (slots, Hp, axes): of obstacles away from the side it is on.
+    """Return the largest turn (keep-outs, Hp) of each normal: of obstacles away from the side that the agent is on.
 
     Args:
-        normal: unit vectors from keep-outs to the guess.
-        to_goal: (slots, Hp, axes) from the guess to the goal.
-        obstacles: slots of obstacles.
+        normal: (keep-outs, Hp, axes) unit vectors from keep-outs to the guess.
+        to_goal: (keep-outs, Hp, axes) from the guess to the goal.
+        obstacles: indices of the keep-outs that are obstacles.
         stuck_01: how far the own plan is stuck.
         params: angles.
     """
@@ -141,13 +141,13 @@ def _approach_m(keep_outs: KeepOuts, here_ned_m: Array, apart: Array, params: Se
 
 
 def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: Array, *, angle_rad: Array) -> Array:
-    """Return normals (slots, Hp, axes), turned where they point against the goal, so that head-on agents pass.
+    """Return normals (keep-outs, Hp, axes), turned where they point against the goal, so that head-on agents pass.
 
     Peers follow one right-of-way rule: each turns normals clockwise seen from above (as NED yaw), so that two that meet
-    head-on both give way to the left. Obstacles are passed on the side the agent is on. `angle_rad` (max_keep_outs, Hp)
+    head-on both give way to the left. Obstacles are passed on the side the agent is on. `angle_rad` (keep-outs, Hp)
     is the largest turn: full for obstacles, for peers only when the own plan is stuck, because turned normals would
-    also keep a swarm that shares one goal from closing in evenly. `to_goal` (slots, Hp, axes) is what is left to fly
-    with regard to the keep-out: one that moves towards an agent at its goal is passed as well, not fled from.
+    also keep a swarm that shares one goal from closing in evenly. `to_goal` (keep-outs, Hp, axes) is what is left to
+    fly with regard to the keep-out: one that moves towards an agent at its goal is passed as well, not fled from.
     """
     if not angle_rad.any():
         return normal

@@ -152,16 +152,16 @@ def without_setpoints(
     dt_s = path.dt_us * 1e-6
     keeps_s = _KEEPS_S if keeps_s is None else keeps_s
     coasts_s = keeps_s if coasts_s is None else max(keeps_s, coasts_s)
-    lag = max(0, min(round(min(lag_s, keeps_s) / dt_s), len(path.pos_ned_m) - 3))
-    first, second = path.pos_ned_m[lag : lag + 2]
-    accel = _level_accel_ned_m_s2(path, lag)
+    lag_steps = max(0, min(round(min(lag_s, keeps_s) / dt_s), len(path.pos_ned_m) - 3))
+    first, second = path.pos_ned_m[lag_steps : lag_steps + 2]
+    accel = _level_accel_ned_m_s2(path, lag_steps)
     vel = (second - first) / dt_s - 0.5 * dt_s * accel  # at the first point
     if path.setpoint_accel_ned_m_s2 is not None:
         accel = path.setpoint_accel_ned_m_s2 - drag_1_s * vel
-    ahead_s = grid(max(1, round(_STOPS_US / path.dt_us) - lag)) * dt_s
-    limits = {"keeps_s": keeps_s - lag * dt_s, "coasts_s": coasts_s - lag * dt_s, "drag_1_s": drag_1_s}
+    ahead_s, lagged_s = grid(max(1, round(_STOPS_US / path.dt_us) - lag_steps)) * dt_s, lag_steps * dt_s
+    limits = {"keeps_s": keeps_s - lagged_s, "coasts_s": coasts_s - lagged_s, "drag_1_s": drag_1_s}
     pos = without_setpoints_ned_m(first, vel, accel, ahead_s, **limits)
-    return replace(path, pos_ned_m=np.concatenate((path.pos_ned_m[:lag], pos)) if lag else pos)
+    return replace(path, pos_ned_m=np.concatenate((path.pos_ned_m[:lag_steps], pos)) if lag_steps else pos)
 
 
 def _level_accel_ned_m_s2(path: PredictedPath, step: int) -> Array:

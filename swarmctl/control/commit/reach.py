@@ -47,8 +47,8 @@ from swarmctl.core.types import Array
 FAR_LEASE_US = 1_500_000
 _LOOKING_US = 100_000  # how often it is looked who is far
 _COMING_M, _LEAVING_M = 1.0, 1.5  # peers this much beyond where they have to acknowledge are near already, or still
-_EVERY = 3  # points of trajectories that are looked at for this
-_OWN = 8  # trajectories whose extent is remembered
+_POINT_STRIDE = 3  # of the points of trajectories that are looked at for this
+_REMEMBERED = 8  # own trajectories whose extent is known
 _MODEST_01 = 1.0 + 1e-6  # rounding of messages
 _NOBODY: frozenset[int] = frozenset()
 
@@ -114,7 +114,7 @@ class FarPeers:
             return False
         self._looked_us = utc_us
         known = [agent for agent in self._peers if agent in messages]
-        points = np.concatenate([trajectory.pos_ned_m[::_EVERY] for trajectory in own] + [own[0].pos_ned_m[-1:]])
+        points = np.concatenate([trajectory.pos_ned_m[::_POINT_STRIDE] for trajectory in own] + [own[0].pos_ned_m[-1:]])
         room_m = [_LEAVING_M if agent in self.near else _COMING_M for agent in known]
         self.near = self._peers - self._clear(known, points, messages, utc_us, room_m)
         return True
@@ -218,7 +218,7 @@ class FarPeers:
     def _extent(self, trajectory: Trajectory) -> _Extent:
         known = self._extents.get(id(trajectory))
         if known is None:
-            if len(self._extents) >= _OWN:
+            if len(self._extents) >= _REMEMBERED:
                 self._extents.clear()
             known = self._extents[id(trajectory)] = trajectory, _extent_of(trajectory)
         return known[1]

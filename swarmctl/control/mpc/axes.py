@@ -114,7 +114,7 @@ class HalfSpaces:
     """Holds rows `normal[s, k] . p_k >= offset[s, k]` for keep-outs s and steps k = 1..Hp; offset -inf disables a row.
 
     Only steps 0.08 s apart become rows, from the first one that increments can change: the certificate checks true
-    distances in between. One more row for each slot looks beyond the horizon, so that there is room left to stop:
+    distances in between. One more row for each keep-out looks beyond the horizon, so that there is room left to stop:
     `normal[s, -1] . (p_Hp + stop_s[s] v_Hp) >= stop_offset_m[s]`.
     """
 

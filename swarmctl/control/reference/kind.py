@@ -21,7 +21,7 @@ from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Sampled
 
 MOVING_ROOM = 1.04  # places round a moving reference are farther apart than plans keep: tracking errors differ
-Heading = Callable[[Array], Array]  # yaws (K,) [rad], clockwise from north, at mission times (K,) >= 0 [s]
+SampledYaw = Callable[[Array], Array]  # yaws (K,) [rad], clockwise from north, at mission times (K,) >= 0 [s]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +55,7 @@ class MissionKind(Params):
     def reference(self, place: Place) -> Sampled:
         """Return the reference of one agent as a function of mission time."""
 
-    def heading(self, place: Place) -> Heading | None:
+    def heading(self, place: Place) -> SampledYaw | None:
         """Return the yaw of one agent as a function of mission time; None for `mission.yaw_rad`."""
         return None
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.reference import kinds
-from swarmctl.control.reference.kind import MISSIONS, Heading, MissionKind, Place
+from swarmctl.control.reference.kind import MISSIONS, MissionKind, Place, SampledYaw
 from swarmctl.control.reference.polynomial import through
 from swarmctl.core.discovery.declared import modules_of
 from swarmctl.core.discovery.own import BuiltInOrOwn, OwnError, in_words, own_class
@@ -105,7 +105,7 @@ class _Flown:
     """Holds what a mission asks of one agent."""
 
     sampled: Sampled
-    heading: Heading | None
+    heading: SampledYaw | None
     offset_ned_m: Array  # (3,)
     jumps: bool
     fixed_in_time: bool

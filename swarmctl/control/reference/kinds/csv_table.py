@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.reference.kind import Heading, Place, SharedReference, mission_kind
+from swarmctl.control.reference.kind import Place, SampledYaw, SharedReference, mission_kind
 from swarmctl.control.reference.polynomial import PiecewisePolynomial, through
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Sampled
@@ -68,7 +68,7 @@ class CsvParams(SharedReference):
 
         return sampled
 
-    def heading(self, place: Place) -> Heading | None:
+    def heading(self, place: Place) -> SampledYaw | None:
         flight, (sign, offset_rad) = self._flight(place), _YAWS_TO_NED[self.frame]
         if flight.coefficients.shape[2] < 4:
             return None
