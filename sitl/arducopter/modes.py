@@ -40,9 +40,9 @@ NOT_FLOWN_HERE = {  # modes of ArduCopter 4.6 that this simulator does not enter
     27: "AUTO_RTL",
     28: "TURTLE",
 }
-NEEDS_POSITION = frozenset(
+NEEDS_POSITION = frozenset(  # modes that need a position while armed; LAND descends without one
     {CopterMode.GUIDED, CopterMode.LOITER, CopterMode.RTL, CopterMode.BRAKE}
-)  # modes that need a position while armed; LAND descends without one
+)
 NO_ARMING_IN = frozenset({CopterMode.RTL, CopterMode.LAND, CopterMode.BRAKE})
 ENDS_ON_GROUND = frozenset({CopterMode.RTL, CopterMode.LAND})  # these disarm by themselves after touchdown
 WITHOUT_POSITION_CONTROL = frozenset({CopterMode.STABILIZE, CopterMode.ALT_HOLD})

@@ -96,7 +96,7 @@ class ErrorModel:
         return math.hypot(north, east), down
 
 
-_PERFECT = ErrorModel(
+_PERFECT = ErrorModel(  # carries faults only
     position_m=(0.0,) * 3,
     position_tau_s=1.0,
     velocity_m_s=(0.0,) * 3,
@@ -107,7 +107,7 @@ _PERFECT = ErrorModel(
     noise_velocity_m_s=0.0,
     noise_attitude_rad=0.0,
     latency_s=(0.0, 0.0),
-)  # carries faults only
+)
 
 _INERTIAL = partial(
     ErrorModel,

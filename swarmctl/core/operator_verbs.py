@@ -75,9 +75,9 @@ OPERATOR_VERBS = {
         help="Go on after `hold`, and take the vehicle back after a pilot or its autopilot took over.",
         phases=_AIRBORNE | {"ARM", "LAND"},  # also of a vehicle found in the air under a pilot, or taken as it landed
     ),
-    "land": OperatorVerb(
+    "land": OperatorVerb(  # never superseded: a stamp a little in the future must not delay a landing
         help="Separate, then land.", phases=_NOT_LANDING | {"LAND"}, is_stop=True, never_superseded=True
-    ),  # a stamp a little in the future must not delay a landing
+    ),
     "rtl": OperatorVerb(
         help="Fly back to the start under the agent's own MPC, then land. The autopilot's return mode is not used.",
         phases=_NOT_LANDING,

@@ -36,9 +36,9 @@ NOTHING: frozenset[str] = frozenset()
 DIES, RESTARTS, TAKEN_OVER = "dies", "restarts", "is taken over"
 INTERRUPTIONS = frozenset({DIES, RESTARTS, TAKEN_OVER})
 _PARAMS = CommitParams()
-_SOMEBODY = KeepOuts(
+_SOMEBODY = KeepOuts(  # the planner of symbols does not look where
     [keep_out_of_commitment(np.zeros((2, 3)), AGENTS, SeparationParams(), SeparationParams().budget)]
-)  # the planner of symbols does not look where
+)
 
 
 @dataclass(frozen=True)

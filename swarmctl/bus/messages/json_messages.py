@@ -21,18 +21,16 @@ _Struct = TypeVar("_Struct", bound=msgspec.Struct)
 
 MAX_OBSTACLES = 64  # each visible one takes 20 us of a tick of 20 ms; 6000 took 130 ms
 _OBSTACLE_KEYS = {"center_ned_m", "radius_m", "keep_out_m", "visibility_m"}  # no message may leave these out
-MAX_VERSION_STEP = (
-    2**20
-)  # largest step of the list's version: late joiners have missed many, and forgers don't reach its end
+# largest step of the list's version: late joiners have missed many, and forgers don't reach its end
+MAX_VERSION_STEP = 2**20
 MAX_ANCESTORS = 64  # lists before this one by which it is known whether its operator knew another list
 MAX_REASON = 500  # longest reason of a refusal, or text about what is obeyed
 Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 Number = Annotated[int, msgspec.Meta(ge=-(2**31), lt=2**31)]  # of a vehicle; longer ones can't be formatted
 Agents = Annotated[tuple[Count, ...], msgspec.Meta(max_length=256)]
-Lags = Annotated[
-    dict[Count, Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)]], msgspec.Meta(max_length=256)
-]  # by agent
+_Lag = Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)]
+Lags = Annotated[dict[Count, _Lag], msgspec.Meta(max_length=256)]  # by agent
 
 
 class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):

@@ -20,9 +20,8 @@ from swarmctl.core.types import MAX_MARGIN_M, MAX_SPEED_M_S, MAX_STEP_US, MIN_ST
 FLOAT_VERSION = 3
 COMPACT_VERSION = 4
 MAX_POINTS = 250
-_HEADER = struct.Struct(
-    "<2sBBIIIqifBBbx3h"
-)  # magic, version, flags, agent, boot, seq, t0, dt, margin, points, own length, exponent of the unit, acceleration
+# magic, version, flags, agent, boot, seq, t0, dt, margin, points, own length, exponent of the unit, acceleration
+_HEADER = struct.Struct("<2sBBIIIqifBBbx3h")
 _MAGIC = b"SP"
 _NUMBER = np.dtype("<f4")
 _BEGIN, _BEND = np.dtype("<i4"), np.dtype("i1")

@@ -21,9 +21,9 @@ class CommitParams(Params):
     horizon: int = Field(20, ge=5, le=60)  # steps before the final braking
     moves: int = Field(8, ge=2, le=40)  # control horizon: steps after which the input is constant
     brake_m_s2: float = Field(1.5, ge=0.5, le=10)  # deceleration of the final braking
-    tilt_fraction_01: float = Field(
+    tilt_fraction_01: float = Field(  # share of the controller's tilt that plans may use; the rest is for tracking
         0.8, gt=0, le=1
-    )  # share of the controller's tilt that plans may use; the rest is for tracking
+    )
     period_s: float = Field(0.1, ge=0, le=2)  # least time between two plans
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # least time from proposing to flying; the vehicle may need more
     lead_max_s: float = Field(1.5, ge=0.1, le=5)  # longest such lead, however late the others answer
