@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from swarmctl.agent.ports import TickSink
 from swarmctl.agent.tick_results import ControlOutput, PlanningResult
@@ -17,6 +17,7 @@ from swarmctl.control.estimation.disturbance import Estimate
 from swarmctl.control.phases.mission_state import MissionState
 from swarmctl.core.clock import Clock
 from swarmctl.core.operator_verbs import Answer
+from swarmctl.core.quantile import quantile
 from swarmctl.core.recorded.received import frame_rows, path_row, status_row
 from swarmctl.core.recorded.records import pack_tick, tick_row
 from swarmctl.core.recorded.tick_record import TickRecord, TickTiming
@@ -199,7 +200,7 @@ class TelemetryPublisher:
             outcome=mission.outcome,
             position_error_m=_finite(error_m),
             separation_m=_finite(record.nearest_peer_m),
-            tick_p99_ms=percentile_99(self._recent_ms),
+            tick_p99_ms=quantile(self._recent_ms, 0.99),
             ticks=record.seq,
             deadline_misses=record.deadline_misses,
             plan_staleness_ms=_finite(record.plan_staleness_ms),
@@ -212,14 +213,6 @@ class TelemetryPublisher:
             code=self._code,
             lags_us={} if self._uses_commitments else dict(self._lags_us(record.utc_us)),
         )
-
-
-def percentile_99(values: Iterable[float]) -> float:
-    """Return the 99th percentile of some values, interpolated as by numpy."""
-    ordered = sorted(values)
-    place = 0.99 * (len(ordered) - 1)
-    below, above = ordered[math.floor(place)], ordered[math.ceil(place)]
-    return below + (above - below) * (place % 1.0)
 
 
 def _known(value: float | None) -> float:

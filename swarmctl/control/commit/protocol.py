@@ -71,7 +71,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -80,6 +80,7 @@ import numpy as np
 from swarmctl.control.collision.keep_outs import KeepOuts
 from swarmctl.control.commit.commit_params import CommitParams
 from swarmctl.control.commit.situation import Situation
+from swarmctl.core.quantile import quantile
 from swarmctl.core.trajectory import Trajectory, by_exact_clock, delayed, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array
@@ -225,7 +226,7 @@ class Commitments:
             self._late_us -= self._proposed_late_us
             self.counts.committed += 1
             self._latencies_s.append((utc_us - mine.made_utc_us) * 1e-6)
-            self._set_lead(_LEAD_FACTOR * _quantile(self._latencies_s, _QUANTILE_01) + _TICK_S)
+            self._set_lead(_LEAD_FACTOR * quantile(self._latencies_s, _QUANTILE_01) + _TICK_S)
 
     def conflicting_peers(self, utc_us: int, peers: Mapping[int, TrajectoryMessage]) -> set[int]:
         """Return peers whose committed trajectory conflicts with the own one, because one of the two had to evade.
@@ -374,11 +375,3 @@ def acknowledgements(peers: Mapping[int, TrajectoryMessage], without: Set[int]) 
         for agent, message in peers.items()
         if message.proposal is not None and agent not in without
     }
-
-
-def _quantile(values: Iterable[float], share_01: float) -> float:
-    """Return a quantile, linear between values as that of NumPy, which loads its masked arrays at the first call."""
-    ordered = sorted(values)
-    low, part = divmod(share_01 * (len(ordered) - 1), 1.0)
-    below, above = ordered[int(low)], ordered[min(int(low) + 1, len(ordered) - 1)]
-    return below + part * (above - below)
