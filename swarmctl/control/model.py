@@ -35,11 +35,7 @@ class VehicleModelParams(Params):
     thrust_max_01: float = Field(1.0, gt=0, le=1)  # largest thrust that is asked for
     tilt_max_rad: float = Field(0.6, gt=0, lt=1.5)  # largest tilt that is asked for, by every controller and protection
     heading: Literal["euler", "swing_twist"] = "euler"  # how a tilted body is turned; swing_twist: as little as can be
-    speed_max_m_s: float = Field(  # references far away are approached no faster, and as the vehicle can brake;
-        20.0,
-        gt=0,
-        le=100,  # faster missions are refused
-    )
+    speed_max_m_s: float = Field(20.0, gt=0, le=100)  # far references are approached no faster; faster missions refused
 
     def lag(self) -> Lag | None:
         """Return the lag of the attitude behind its setpoints; None if it follows at once."""
