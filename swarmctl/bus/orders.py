@@ -32,9 +32,10 @@ class Orders:
     """Filters the orders to one agent, so that each is obeyed once, however often it is repeated.
 
     An order is valid for `VALID_US`: an older one may have been meant for another flight. Of two orders the one with
-    the later stamp counts, in whatever sequence they arrive, so a repeated `hold` does not undo a `resume`. Only `land`
-    is obeyed whatever came before it. A numbered order is answered, and its number marks what repeats it under newer
-    stamps, so a `hold` that is repeated for long does not undo a `resume` either.
+    the later stamp counts, in whatever sequence they arrive, so a repeated `hold` does not undo a `resume`. Verbs that
+    are never superseded (`land`, `exclude`) are obeyed whatever came before them. A numbered order is answered, and its
+    number marks what repeats it under newer stamps, so a `hold` that is repeated for long does not undo a `resume`
+    either.
 
     An operator whose clock is far from ours stamps one copy of an order by its own clock and, as soon as it knows it,
     one by ours (`order_messages`). The former copy alarms nobody if the latter comes within `VALID_US`.

@@ -1,7 +1,7 @@
 """The topics of the bus: one table. A bus delivers no message that is too long for its topic.
 
-Their messages are laid out in `bus/messages/` and `relay.py`; ticks
-are rows of `core.recorded.records`, events lines of `telemetry.recording.shared_events`.
+Their messages are laid out in `bus/messages/` and `relay.py`; ticks are rows of `core.recorded.records`, events lines
+of `telemetry.recording.shared_events`.
 """
 
 from __future__ import annotations

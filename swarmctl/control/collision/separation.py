@@ -138,8 +138,8 @@ def without_setpoints(
 
     Its autopilot keeps the last attitude and thrust for a while, so the acceleration goes on that the vehicle has when
     it has taken that attitude, instead of what was planned to follow: the one that its last setpoint asks for, if that
-    is told, or the level one of the path. It may then fly on level. Where the returned path
-    ends the autopilot brakes, as beyond the end of any path.
+    is told, or the level one of the path. It may then fly on level. Where the returned path ends the autopilot brakes,
+    as beyond the end of any path.
 
     Args:
         path: what was planned.
