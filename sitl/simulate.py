@@ -26,14 +26,9 @@ from swarmctl.ops.flight.summary import draw_recording, summary_lines, unwritten
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.file_names import RECORDING, TRUTH, events_file, ticks_file
-from swarmctl.telemetry.recording.run_folder import (
-    Outcome,
-    create_run_folder,
-    finish_run,
-    forget_outcome,
-    held_run,
-    write_config,
-)
+from swarmctl.telemetry.recording.kept_outcome import forget_outcome
+from swarmctl.telemetry.recording.new_run_folder import create_run_folder, held_run, write_config
+from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
 from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording
 from swarmctl.wall_clock import utc_us
 

@@ -28,7 +28,7 @@ from swarmctl.ops.orders.operator import read_agents, read_statuses
 from swarmctl.ops.orders.order_delivery import Reply, deliver
 from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch
 from swarmctl.telemetry.recording.file_names import CONFIG
-from swarmctl.telemetry.recording.run_folder import create_run_folder, write_config
+from swarmctl.telemetry.recording.new_run_folder import create_run_folder, write_config
 from swarmctl.wall_clock import utc_us
 
 _READY_S = 120.0  # for the launch to have started every process

@@ -30,7 +30,7 @@ from sitl.studies.thesis.trace import Beside, Row, Trace
 from sitl.studies.thesis.verdicts import MEANING, counted, counts_text, verdict_of
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError
 from swarmctl.process_lifetime import serve_parent
-from swarmctl.telemetry.recording.run_folder import create_run_folder
+from swarmctl.telemetry.recording.new_run_folder import create_run_folder
 from swarmctl.wall_clock import utc_us
 
 TIMING = "timing"  # name of the timing rows for `--only`

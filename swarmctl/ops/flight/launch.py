@@ -157,7 +157,7 @@ def started(config: Config, options: LaunchOptions, part: SwarmPart) -> Iterator
 @contextmanager
 def _run_folder(config: Config, options: LaunchOptions) -> Iterator[Path]:
     """Yield the folder of a new run, with its configuration; no other run begins in it meanwhile."""
-    from swarmctl.telemetry.recording.run_folder import create_run_folder, held_run, write_config  # heavy
+    from swarmctl.telemetry.recording.new_run_folder import create_run_folder, held_run, write_config  # heavy
 
     directory = create_run_folder(options.run_dir, config.name, utc_us()).resolve()
     with held_run(directory):

@@ -140,7 +140,7 @@ def _model_lines(found: Identified, before: VehicleModelParams) -> Sequence[str]
 
 
 def _run_folder(run_dir: Path | None) -> Path:
-    from swarmctl.telemetry.recording.run_folder import create_run_folder  # heavy
+    from swarmctl.telemetry.recording.new_run_folder import create_run_folder  # heavy
 
     return create_run_folder(run_dir, "identify", utc_us(), advice="Go to another folder")
 

@@ -1,18 +1,13 @@
-"""Manages the folder of one run: creates it before the flight, judges and closes it afterwards, reports it again."""
+"""Judges a run and closes its folder after the flight, reports it again, and compares it with others."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
-
-import msgspec
+from typing import Any, NamedTuple
 
 from swarmctl.core.json_safe import to_json
 from swarmctl.core.recorded.received import RECEIVED_COLUMNS
@@ -21,11 +16,10 @@ from swarmctl.core.recorded.stored_column import StoredColumn, dtype_of
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.files import hold, is_held, replace_bytes, replace_text, write_each
-from swarmctl.telemetry.evaluation.referee import Rules, RunData, RunMode, evaluate, flown_without
+from swarmctl.files import is_held, replace_text, write_each
+from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate, flown_without
 from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.recording.file_names import (
-    AGENT_FILE,
     CONFIG,
     EVENTS,
     OUTCOME,
@@ -33,12 +27,12 @@ from swarmctl.telemetry.recording.file_names import (
     PACKED_RECEIVED,
     PACKED_TICKS,
     PACKED_TRUTH,
-    RECORDING,
     STUDY_ROWS,
     SUMMARY,
     TRUTH,
     events_file,
 )
+from swarmctl.telemetry.recording.kept_outcome import KeptOutcome, keep_outcome, kept_outcome
 from swarmctl.telemetry.recording.obstacle_lists import recorded_obstacles
 from swarmctl.telemetry.recording.run_files import (
     load_run,
@@ -52,15 +46,10 @@ from swarmctl.telemetry.recording.run_files import (
 from swarmctl.telemetry.report.comparison import JudgedRun, write_comparison
 from swarmctl.telemetry.report.run_report import FIGURES, REPORT, write_figures, write_report
 
-_OUTCOME_BYTES = 4096
-_PROBLEM_CHARACTERS = 500  # of a problem that is kept in it
-_LAUNCHES_PER_SECOND = 1000
 _NO_RUN = (
     f"holds no run, only a {CONFIG}. A sweep that was cut off before its first flight had ended leaves no more: "
     "it has nothing to report, and the same call of it goes on"
 )
-_TAKEN = frozenset((EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING, REPORT, STUDY_ROWS))
-_JUST_BEGUN = "another run has just begun there. Choose a new folder"
 
 _RAW_ROWS = (  # files of raw rows, the suffixes that they have as Parquet, and their columns
     ("agent-*.ticks", PACKED_TICKS, COLUMNS),
@@ -68,98 +57,6 @@ _RAW_ROWS = (  # files of raw rows, the suffixes that they have as Parquet, and 
     ("agent-*.received", PACKED_RECEIVED, RECEIVED_COLUMNS),
     (TRUTH, Path(PACKED_TRUTH).suffix, TRUTH_COLUMNS),
 )
-
-
-def create_run_folder(
-    base: Path | None, name: str, utc_us: int, *, advice: str = "Choose another with --run-dir"
-) -> Path:
-    """Create and return the folder of a new run.
-
-    Args:
-        base: the folder itself; None for `runs/<UTC>-<name>`, with a number appended if that name is taken.
-        name: name of the configuration.
-        utc_us: start of the run [us since 1970].
-        advice: what to do where it can't be made.
-
-    Raises:
-        ConfigError: `base` contains a run already, or a symbolic link through which files would be written, is a file
-            or within one, or its name is no text.
-        StartError: the folder can't be created.
-    """
-    try:
-        if base is not None:
-            str(base).encode()  # names that are no text could be written to no file of the run
-            base.mkdir(parents=True, exist_ok=True)
-            _refuse_taken(base)
-            if is_held(base.resolve()):  # by a run that begins, and has no other files yet
-                raise ConfigError(f"--run-dir {base}", [_JUST_BEGUN])
-            return base
-        stamp = datetime.fromtimestamp(utc_us / 1e6, UTC).strftime("%Y%m%dT%H%M%SZ")
-        Path("runs").mkdir(exist_ok=True)
-        for attempt in range(1, _LAUNCHES_PER_SECOND):
-            path = Path("runs") / (f"{stamp}-{name}" if attempt == 1 else f"{stamp}-{name}-{attempt}")
-            with contextlib.suppress(FileExistsError):
-                path.mkdir(exist_ok=False)
-                return path
-    except UnicodeEncodeError as error:
-        raise ConfigError("--run-dir", [f"{base!r} is no text in UTF-8. Choose another name"]) from error
-    except OSError as error:
-        if base is not None and isinstance(error, FileExistsError | NotADirectoryError):
-            raise ConfigError(f"--run-dir {base}", ["is a file, or within one. Choose another folder"]) from error
-        raise StartError(f"run folder can't be made: {error}. {advice}") from error
-    raise StartError(f"runs/{stamp}-{name}: {_LAUNCHES_PER_SECOND} launches in one second")
-
-
-def _refuse_taken(base: Path) -> None:
-    links = sorted(path.name for path in base.iterdir() if path.is_symlink())
-    if links:
-        raise ConfigError(f"--run-dir {base}", [f"holds a symbolic link ({links[0]}). Choose a new folder or empty it"])
-    taken = sorted(path.name for path in base.iterdir() if _is_recorded(path.name))
-    if taken:
-        raise ConfigError(f"--run-dir {base}", [f"holds a run already ({taken[0]}). Choose a new folder or empty it"])
-
-
-def _is_recorded(name: str) -> bool:
-    """Return whether a file of a run folder is there only once a run has begun."""
-    return name in _TAKEN or name.endswith(events_file("")) or bool(AGENT_FILE.match(name))
-
-
-def write_config(directory: Path, text: str, mode: RunMode = "realtime") -> None:
-    """Write the resolved configuration of a new run into its folder, and keep room there for how it ends.
-
-    Args:
-        directory: the run folder.
-        text: the configuration.
-        mode: how it is flown, which a run that is cut off could not tell later.
-
-    Raises:
-        ConfigError: another configuration is there, which may be the user's own.
-        OSError: it can't be written.
-    """
-    path = directory / CONFIG
-    if path.exists() and path.read_text(encoding="utf-8", errors="replace") != text:
-        raise ConfigError(f"--run-dir {directory}", [f"holds another {CONFIG}. Choose a new folder or move that file"])
-    replace_text(path, text)
-    replace_bytes(directory / OUTCOME, _padded({"mode": mode}))
-
-
-@contextlib.contextmanager
-def held_run(directory: Path) -> Iterator[None]:
-    """Keep others from flying into the folder of a new run, and from finishing it while its rows are in memory.
-
-    Of several that begin at once in one folder, `create_run_folder` accepts each; one alone comes to hold it.
-
-    Raises:
-        ConfigError: another run has it, or had it meanwhile.
-    """
-    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        if not hold(fd):
-            raise ConfigError(f"--run-dir {directory}", [_JUST_BEGUN])
-        _refuse_taken(directory)
-        yield
-    finally:
-        os.close(fd)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,18 +67,6 @@ class Outcome:
     problems: tuple[str, ...] = ()  # problems in words; each becomes a violation
     speed_factor: float | None = None  # simulated seconds per wall second
     events: Sequence[Mapping[str, Any]] = field(default=())  # events of the launcher itself
-
-
-class _KeptOutcome(msgspec.Struct):
-    """How a run ended: unless it says otherwise, it was cut off."""
-
-    outcome: Annotated[str, msgspec.Meta(pattern="^(completed|failed|interrupted)$")] = "failed"
-    problems: list[str] = msgspec.field(default_factory=lambda: ["the launcher did not finish this run"])
-    speed_factor: float | None = None
-    mode: RunMode = "realtime"
-
-    def as_outcome(self) -> Outcome:
-        return Outcome(outcome=self.outcome, problems=tuple(self.problems), speed_factor=self.speed_factor)
 
 
 class Finished(NamedTuple):
@@ -220,47 +105,14 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
         REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules=rules),
     }
     unwritten = write_each(writers)
-    _keep_outcome(directory, outcome, rules.mode)  # for what was not written, or is damaged or removed later
+    kept = KeptOutcome(
+        outcome=outcome.outcome,
+        problems=list(outcome.problems),
+        speed_factor=outcome.speed_factor,
+        mode=rules.mode,
+    )
+    keep_outcome(directory, kept)  # for what was not written, or is damaged or removed later
     return Finished(summary, unwritten)
-
-
-def _keep_outcome(directory: Path, outcome: Outcome, mode: RunMode) -> None:
-    """Write how a run ended into the room that was kept for it, which a full disk has still."""
-    problems, shown = [problem[:_PROBLEM_CHARACTERS] for problem in outcome.problems], len(outcome.problems)
-    while True:
-        told = [*problems[:shown], *([f"and {len(problems) - shown} more"] if shown < len(problems) else [])]
-        kept = _KeptOutcome(outcome=outcome.outcome, problems=told, speed_factor=outcome.speed_factor, mode=mode)
-        content = _padded(msgspec.to_builtins(kept))
-        if len(content) <= _OUTCOME_BYTES or not shown:
-            break
-        shown //= 2
-    _fill_outcome(directory, content)
-
-
-def forget_outcome(directory: Path, mode: RunMode) -> None:
-    """Leave of how a run ended what a run that was cut off has: how it was flown."""
-    _fill_outcome(directory, _padded({"mode": mode}))
-
-
-def _padded(kept: Mapping[str, Any]) -> bytes:
-    return to_json(kept).encode().ljust(_OUTCOME_BYTES)
-
-
-def _fill_outcome(directory: Path, content: bytes) -> None:
-    """Write into the room that was kept, if it still is."""
-    with contextlib.suppress(OSError):
-        fd = os.open(directory / OUTCOME, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-        with os.fdopen(fd, "wb") as file:
-            file.write(content)
-
-
-def _kept_outcome(directory: Path) -> _KeptOutcome:
-    """Return how a run ended whose files the disk did not take; that it was cut off, where nothing is known of it."""
-    text = read_text(directory / OUTCOME).strip()
-    try:
-        return msgspec.json.decode(text, type=_KeptOutcome)
-    except (msgspec.MsgspecError, UnicodeEncodeError):
-        return _KeptOutcome()
 
 
 def report_run(directory: Path, rules: Rules) -> Path:
@@ -277,10 +129,9 @@ def report_run(directory: Path, rules: Rules) -> Path:
         run = load_run(directory)
         if not (run.ticks or run.events or len(run.truth) or (directory / OUTCOME).exists()):
             raise ConfigError(str(directory), [_NO_RUN])
-        kept = _kept_outcome(directory)
-        outcome = kept.as_outcome()
-        problems = dict.fromkeys((*outcome.problems, *_cut_off(run, outcome)))
-        ended = replace(outcome, problems=tuple(problems))
+        kept = kept_outcome(directory)
+        problems = dict.fromkeys((*kept.problems, *_cut_off(run, kept.outcome)))
+        ended = Outcome(outcome=kept.outcome, problems=tuple(problems), speed_factor=kept.speed_factor)
         finished = finish_run(directory, replace(rules, mode=kept.mode), ended, run)
         if finished.unwritten:
             raise StartError(f"{directory}: can't be written: {'; '.join(finished.unwritten)}")
@@ -292,10 +143,10 @@ def report_run(directory: Path, rules: Rules) -> Path:
         raise StartError(f"{directory / REPORT}: can't be written: {error.strerror or error}") from error
 
 
-def _cut_off(run: RunData, outcome: Outcome) -> Iterator[str]:
+def _cut_off(run: RunData, outcome: str) -> Iterator[str]:
     """Yield whose ticks end in flight, or before it, although the run was completed: the disk was full from then on."""
     without = flown_without(run.events)
-    for agent, rows in run.ticks.items() if outcome.outcome == "completed" else ():
+    for agent, rows in run.ticks.items() if outcome == "completed" else ():
         if not len(rows) or agent in without:
             continue
         if len(flight_rows(rows[-1:])) or rows["phase"][-1] < Phase.ARM:

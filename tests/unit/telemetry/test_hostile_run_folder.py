@@ -21,7 +21,7 @@ from swarmctl.config import Config, dump, load
 from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.errors import ConfigError
 from swarmctl.ops.flight.summary import rewrite_report
-from swarmctl.telemetry.recording.run_folder import create_run_folder
+from swarmctl.telemetry.recording.new_run_folder import create_run_folder
 
 
 @pytest.fixture

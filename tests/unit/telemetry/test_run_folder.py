@@ -30,16 +30,10 @@ from swarmctl.files import hold
 from swarmctl.telemetry.evaluation.referee import Rules
 from swarmctl.telemetry.recording import run_folder
 from swarmctl.telemetry.recording.file_names import OUTCOME
+from swarmctl.telemetry.recording.new_run_folder import create_run_folder, held_run, write_config
 from swarmctl.telemetry.recording.obstacle_lists import recorded_list
 from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, read_received, write_parquet
-from swarmctl.telemetry.recording.run_folder import (
-    Outcome,
-    create_run_folder,
-    finish_run,
-    held_run,
-    report_run,
-    write_config,
-)
+from swarmctl.telemetry.recording.run_folder import Outcome, finish_run, report_run
 from swarmctl.telemetry.report.thinning import thin
 from tests.benches.pages import parsed
 from tests.benches.recorded_runs import FAR_BALL, RULES, UTC_US, flight, write_run
