@@ -7,13 +7,13 @@ from types import MappingProxyType
 
 from swarmctl.bus.bus import Bus, ForwardingBus
 from swarmctl.bus.network.seals import Sealer, SealVerifier
+from swarmctl.bus.peers.clocks import MOST_APART_US
 from swarmctl.bus.refusals import MOST_REFUSED, REPLAYED, RefusedMessage
 from swarmctl.bus.topics import ENDED, FAR_PATH, OBSTACLES, PATH, STATUS, TOO_LONG, TRAJECTORY, Topic
 
-_FOR_FLIGHT_US = 10_000_000  # clocks that are farther apart are not corrected, see `commitment_messages`
 _FOR_LISTS_US = 60_000_000
 FOR_AGENTS_US: Mapping[str, int] = MappingProxyType(
-    {topic.name: _FOR_FLIGHT_US for topic in (PATH, FAR_PATH, STATUS, ENDED, TRAJECTORY)}
+    {topic.name: MOST_APART_US for topic in (PATH, FAR_PATH, STATUS, ENDED, TRAJECTORY)}
     | {OBSTACLES.name: _FOR_LISTS_US}
 )
 # An operator has to understand agents whatever its clock: it stamps orders by what their statuses say.

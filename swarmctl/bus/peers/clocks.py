@@ -20,7 +20,7 @@ from swarmctl.bus.bus import agent_name
 _DRIFT_PART = 50  # two clocks go apart by less than this part of the time that passes: 2 %
 _UNKNOWN_US = 1 << 62
 _UNMEASURED_US = 1 << 61  # bounds beyond are none
-MOST_APART_US = 10_000_000  # that is allowed for; seals are held to it, too
+MOST_APART_US = 10_000_000  # clocks that are farther apart are not corrected; seals are held to it, too
 _TOO_FAR = "which is too far: nothing it says is believed"
 _ADVICE = "Set the clocks of the hosts (chrony, PTP)"
 _REPORTED_US = 50_000  # corrections that differ by more from the last one reported are
