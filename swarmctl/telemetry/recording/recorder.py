@@ -33,6 +33,7 @@ _FLUSH_TIMEOUT_S = 0.25
 _QUEUE = 16384  # items; about 20 s of ticks and frames, 4 MB
 _REOPEN_S = 1.0  # time between attempts to open a file
 _TLOG_STAMP = struct.Struct(">Q")
+_TICKS, _FRAMES, _EVENTS, _PLANS, _RECEIVED = range(5)  # places of the files
 
 
 class Recorder:
@@ -45,14 +46,14 @@ class Recorder:
 
     def __init__(self, directory: Path, agent: int) -> None:
         self._source = agent_name(agent)
-        self._files = (
+        self._files = (  # in the order of their places
             RowFile(directory / ticks_file(agent), TICK_DTYPE.itemsize),
             RowFile(directory / frames_file(agent)),
             RowFile(directory / events_file(self._source)),
             RowFile(directory / plans_file(agent), PLAN_DTYPE.itemsize),
             RowFile(directory / received_file(agent), RECEIVED_DTYPE.itemsize),
         )
-        self._queue: deque[tuple[int, bytes]] = deque()
+        self._queue: deque[tuple[int, bytes]] = deque()  # place of the file, and the row
         self._refused = 0  # written by the tick's thread
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"recorder-{agent}", daemon=True)
@@ -65,19 +66,19 @@ class Recorder:
 
     def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
         """Record one tick, a (1,) array of `TICK_DTYPE`, and the plan that it flew."""
-        self._put(0, row.tobytes())
+        self._put(_TICKS, row.tobytes())
         points = plan_rows(row, flown)
         if len(points):
-            self._put(3, points.tobytes())
+            self._put(_PLANS, points.tobytes())
 
     def received(self, rows: bytes) -> None:
         """Record what one tick has received, rows of `RECEIVED_DTYPE`."""
         if rows:
-            self._put(4, rows)
+            self._put(_RECEIVED, rows)
 
     def frame(self, utc_us: int, frame: bytes) -> None:
         """Record one MAVLink frame, sent or received at `utc_us`."""
-        self._put(1, _TLOG_STAMP.pack(utc_us) + frame)
+        self._put(_FRAMES, _TLOG_STAMP.pack(utc_us) + frame)
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         """Record one event with its fields; events are rare, unlike ticks."""
@@ -85,7 +86,7 @@ class Recorder:
 
     def put_event(self, line: bytes) -> None:
         """Record one event that is a JSON object already, without line breaks."""
-        self._put(2, line + b"\n")
+        self._put(_EVENTS, line + b"\n")
 
     def close(self, timeout_s: float = 2.0) -> None:
         """Write what is queued; after `timeout_s` of a hanging disk the remaining rows count as lost."""
@@ -94,11 +95,11 @@ class Recorder:
         if self._thread.is_alive():
             self._refused += len(self._queue)
 
-    def _put(self, file: int, row: bytes) -> None:
+    def _put(self, place: int, row: bytes) -> None:
         if len(self._queue) >= _QUEUE or self._stop.is_set():
             self._refused += 1
             return
-        self._queue.append((file, row))
+        self._queue.append((place, row))
 
     def _run(self) -> None:
         while not self._stop.wait(_FLUSH_TIMEOUT_S):
@@ -110,11 +111,11 @@ class Recorder:
     def _drain(self) -> None:
         batches: tuple[list[bytes], ...] = tuple([] for _ in self._files)
         for _ in range(len(self._queue)):
-            file, row = self._queue.popleft()
-            batches[file].append(row)
-        for file_, rows in zip(self._files, batches, strict=True):
+            place, row = self._queue.popleft()
+            batches[place].append(row)
+        for file, rows in zip(self._files, batches, strict=True):
             if rows:
-                file_.append(rows)
+                file.append(rows)
 
 
 def event_line(source: str, name: str, t_us: int, utc_us: int, fields: Mapping[str, Any]) -> bytes:
