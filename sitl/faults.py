@@ -1,11 +1,13 @@
 """Faults: the effect of each kind on a world at its begin and its end.
 
-A fault replaces an earlier one of the same kind on the same vehicle (and rotor, and direction of its links). Where the
-directions of two overlap, the newer one acts, and what still runs when it ends acts again. All times are simulated.
+A fault replaces an earlier one of the same kind on the same vehicle (and rotor, and direction of its links), but jumps,
+gusts and winds, which add up. Where the directions of two overlap, the newer one acts, and what still runs when it ends
+acts again. All times are simulated.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
@@ -137,6 +139,7 @@ class Faults:
         self._vehicles, self._first = vehicles, first
         self._waiting = sorted(scheduled, key=lambda fault: fault.at_s)
         self._running: dict[tuple[Any, ...], tuple[int, FaultParams, int, Undo]] = {}
+        self._numbers = itertools.count()  # of faults that add up, which replace none
         self._next_us = self._earliest_us()
 
     def step(self, now_us: int) -> None:
@@ -161,7 +164,7 @@ class Faults:
         for vehicle in range(self._vehicles) if fault.vehicle == EVERY_VEHICLE else (fault.vehicle - self._first,):
             key: tuple[Any, ...] = (fault.kind, vehicle, fault.rotor, fault.direction)
             if fault.kind in _ADD_UP:
-                key = (*key, now_us, len(self._running))
+                key = (*key, next(self._numbers))
             before = self._running.pop(key, None)
             if before is not None:
                 self._end(*before[1:], now_us)

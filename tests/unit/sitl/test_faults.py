@@ -196,6 +196,15 @@ def test_a_wind_blows_from_one_instant_to_the_next_and_on_one_vehicle_only(flown
     assert flown.world.physics.air.still
 
 
+def test_winds_that_begin_at_once_add_up_whatever_another_fault_does(flown: FlownWorld) -> None:
+    begin(flown, kind="gps_loss", for_s=9.0)
+    begin(flown, kind="wind", value=3.0, for_s=1.0)
+    begin(flown, kind="gps_loss")  # in the place of the first one, and to the end
+    begin(flown, kind="wind", value=2.0, for_s=1.0)
+    air = flown.world.physics.air.velocity_ned_m_s(0.0, np.full(2, 10.0), np.zeros((3, 2)))
+    np.testing.assert_allclose(air, [[5.0, 0.0], [0.0, 0.0], [0.0, 0.0]], atol=1e-12)
+
+
 def test_mass_and_battery(flown: FlownWorld) -> None:
     begin(flown, kind="mass", value=1.3, for_s=8.0)
     begin(flown, kind="battery", value=0.1)
