@@ -81,7 +81,7 @@ def _simulate(config: Config, directory: Path) -> int:
     print_line = PlainLines(sys.stdout).print_line  # to a terminal that may have been closed
     for line in (*violation_lines(summary), *summary_lines(summary, directory)):
         print_line(line)
-    print_line(f"{speed_factor:.1f} x real time")
+    print_line(f"{speed_factor:.3g} x real time")
     if unwritten:
         print_line(unwritten_line(directory, finished.unwritten, gone))
     if interrupted:

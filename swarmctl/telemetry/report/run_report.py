@@ -160,7 +160,7 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
             f"{unresponsive['count']}, agent-{unresponsive['agent']} {lasted}",
         )
     if timing["speed_factor"] is not None:
-        yield SummaryRow("speed", f"{timing['speed_factor']:.1f} x real time")
+        yield SummaryRow("speed", f"{timing['speed_factor']:.3g} x real time")
 
 
 def _goal_rows(goals: Mapping[str, Any] | None) -> Iterator[SummaryRow]:
