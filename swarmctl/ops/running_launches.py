@@ -125,6 +125,16 @@ def launch_in(directory: Path) -> RunningLaunch | None:
     return launch if launch is not None and runs(launch) else None
 
 
+def refuse_running(directory: Path) -> None:
+    """Check that no launch still flies into a run folder, or is ending.
+
+    Raises:
+        StartError: one is.
+    """
+    if launch_in(directory) is not None:
+        raise StartError(f"{directory}: its launch still flies or is ending, see: swarmctl status")
+
+
 def runs(launch: RunningLaunch) -> bool:
     """Return whether the process of a launch is still there."""
     try:

@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -16,8 +17,10 @@ from sitl.simulate import simulate
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase
-from swarmctl.errors import ConfigError
+from swarmctl.errors import ConfigError, StartError
+from swarmctl.files import hold
 from swarmctl.ops.decide.verb import decisions_of_run, lines_of, notes_of_run
+from swarmctl.ops.running_launches import LAUNCH_FILE, RunningLaunch, process_start_s
 from swarmctl.telemetry.recording.run_files import read_parquet, write_parquet
 from tests.closed_loop.conftest import mission_t_s
 
@@ -163,6 +166,24 @@ def test_who_has_recorded_no_ticks_or_was_killed_is_named(folder: Path, tmp_path
     write_parquet(killed / "agent-1.parquet", rows[: np.flatnonzero(rows["phase"] == Phase.TRACK)[-1]])
     (note,) = notes_of_run(killed)
     assert note.startswith("agent-1: its ticks end in TRACK; how others noticed is not replayed")
+
+
+def test_a_run_that_is_not_over_is_not_decided_again(folder: Path, tmp_path: Path) -> None:
+    """Files that are read one after another while they grow gave ticks their peers' plans were missing for."""
+    flying = shutil.copytree(folder, tmp_path / "flying")
+    (flying / "summary.json").unlink()
+    with (flying / "agent-1.ticks").open("ab") as file:
+        hold(file.fileno())
+        with pytest.raises(StartError, match=r"agent-1\.ticks: is still written: the run is not over"):
+            decisions_of_run(flying, ())
+    (flying / "agent-1.ticks").unlink()
+    started_s, pid = process_start_s()
+    launch = RunningLaunch("run", "unixsock-stream//x", pid, started_s, 2, str(flying), ending=True)
+    (flying / LAUNCH_FILE).write_bytes(msgspec.json.encode(launch))
+    with pytest.raises(StartError, match="still flies or is ending, see: swarmctl status"):
+        decisions_of_run(flying, ())
+    (flying / LAUNCH_FILE).unlink()
+    assert [agent.phases_differ for agent in decisions_of_run(flying, ())] == [0, 0], "one that was cut off is"
 
 
 def test_what_can_not_be_decided_again_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -17,10 +17,11 @@ from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.decide.again import Decisions, compare, decide_again, recorded_frames
 from swarmctl.ops.decide.deliveries import Recording
+from swarmctl.ops.running_launches import refuse_running
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.recording.file_names import CONFIG, frames_file
-from swarmctl.telemetry.recording.run_files import load_run, read_plans, read_received
+from swarmctl.telemetry.recording.run_files import load_run, read_plans, read_received, read_summary, refuse_recorded
 
 _SHOWN = 10  # differences of an agent, in text
 
@@ -34,8 +35,12 @@ def decisions_of_run(directory: Path, overrides: Sequence[str]) -> list[Decision
 
     Raises:
         ConfigError: it is no run folder, lacks what is needed, or an override is wrong.
+        StartError: the run is not over: its files, read one after another, would end at different times.
     """
     flown = load_recorded(directory)  # refuses what is no run folder before anything of it is imported
+    if read_summary(directory) is None:
+        refuse_running(directory)
+        refuse_recorded(directory)
     config = load(directory / CONFIG, overrides, only_agents=())  # nothing is sent, so nobody's signing key is needed
     run = load_run(directory)
     if config.swarm.agents != flown.swarm.agents:

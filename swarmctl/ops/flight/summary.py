@@ -11,9 +11,8 @@ from swarmctl.bus.bus import agent_name
 from swarmctl.config import Config, load_recorded
 from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.text import printable
-from swarmctl.errors import StartError
 from swarmctl.mavlink.signing.refusals import HARMLESS
-from swarmctl.ops.running_launches import launch_in
+from swarmctl.ops.running_launches import refuse_running
 from swarmctl.ops.supervision.launch_result import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 from swarmctl.telemetry.evaluation.station_clock import corrected_text
@@ -101,8 +100,8 @@ def rewrite_report(directory: Path) -> Path:
     from swarmctl.telemetry.recording.run_folder import report_run
 
     refuse_no_folder(directory)
-    if read_summary(directory) is None and launch_in(directory) is not None:
-        raise StartError(f"{directory}: its launch still flies or is ending, see: swarmctl status")
+    if read_summary(directory) is None:
+        refuse_running(directory)
     return report_run(directory, load_recorded(directory).rules())
 
 

@@ -24,8 +24,8 @@ from swarmctl.core.recorded.records import PLAN_COLUMNS, TICK_DTYPE, TRUTH_COLUM
 from swarmctl.core.recorded.stored_column import StoredColumn, dtype_of
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.text import printable
-from swarmctl.errors import ConfigError
-from swarmctl.files import read_file, replaced
+from swarmctl.errors import ConfigError, StartError
+from swarmctl.files import is_held, read_file, replaced
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.evaluation.station_clock import by_newest_clock, is_of_station
 from swarmctl.telemetry.evaluation.tracks import MAX_RUN_US
@@ -39,6 +39,7 @@ from swarmctl.telemetry.recording.file_names import (
     PACKED_TRUTH,
     SUMMARY,
     TRUTH,
+    events_file,
     plans_file,
     received_file,
 )
@@ -116,6 +117,19 @@ def refuse_no_folder(directory: Path) -> None:
         there = "is a file. Give the run folder that it is in"
         none = "no such run folder. Give one that launch or simulate wrote"
         raise ConfigError(str(directory), [there if directory.exists() else none])
+
+
+def refuse_recorded(directory: Path) -> None:
+    """Check that nobody holds the folder of an unfinished run, or its files, which are packed and then removed.
+
+    Raises:
+        StartError: somebody does.
+    """
+    patterns = ("*.ticks", "*.plans", "*.received", events_file("*"), TRUTH)
+    files = (path for pattern in patterns for path in sorted(directory.glob(pattern)))
+    for path in (directory.resolve(), *files):
+        if is_held(path):
+            raise StartError(f"{path}: is still written: the run is not over. Wait until its agents have ended")
 
 
 def read_rows(path: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:

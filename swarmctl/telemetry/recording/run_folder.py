@@ -40,6 +40,7 @@ from swarmctl.telemetry.recording.run_files import (
     read_summary,
     read_text,
     refuse_other_swarm,
+    refuse_recorded,
     utc_us_of,
     write_parquet,
 )
@@ -125,7 +126,7 @@ def report_run(directory: Path, rules: Rules) -> Path:
     if (directory / STUDY_ROWS).exists():
         raise ConfigError(str(directory), [f"holds a campaign or a sweep, whose page is {REPORT}, and no run"])
     if read_summary(directory) is None:
-        _refuse_recorded(directory)
+        refuse_recorded(directory)
         run = load_run(directory)
         if not (run.ticks or run.events or len(run.truth) or (directory / OUTCOME).exists()):
             raise ConfigError(str(directory), [_NO_RUN])
@@ -163,19 +164,6 @@ def refuse_as_output(output: Path, directory: Path, suffix: str) -> None:
     inside = directory.resolve() in output.resolve().parents
     if inside and output.exists() and output.suffix != suffix:
         raise ConfigError("--output", [f"{output}: is a file of the run; choose one that ends with {suffix}"])
-
-
-def _refuse_recorded(directory: Path) -> None:
-    """Check that nobody holds the folder of an unfinished run, or its files, which are packed and then removed.
-
-    Raises:
-        StartError: somebody does.
-    """
-    patterns = ("*.ticks", "*.plans", "*.received", events_file("*"), TRUTH)
-    files = (path for pattern in patterns for path in sorted(directory.glob(pattern)))
-    for path in (directory.resolve(), *files):
-        if is_held(path):
-            raise StartError(f"{path}: is still written: the run is not over. Wait until its agents have ended")
 
 
 def write_run_figures(directory: Path, rules: Rules, *, png: bool = False) -> Path:
