@@ -17,6 +17,7 @@ from swarmctl.bus.network.hosts import host_problems
 from swarmctl.configuration.constraints import (
     braking_problems,
     forward_problems,
+    horizon_problems,
     obstacle_problems,
     own_controller_problems,
     path_sharing_problems,
@@ -187,6 +188,9 @@ CONSTRAINTS = (
         lambda c: own_controller_problems(c.controller, c.separation, c.agent.barrier),
     ),
     Constraint({"controller", "agent"}, lambda c: tick_problems(c.controller, c.agent.rate_hz)),
+    Constraint(
+        {"controller", "agent", "separation"}, lambda c: horizon_problems(c.controller, c.agent.commit, c.separation)
+    ),
     Constraint({"agent", "separation"}, lambda c: path_sharing_problems(c.agent.path_sharing, c.separation)),
     Constraint(_DRIFT | {"swarm", "limits"}, _separation_problems),
     Constraint(_GOALS | {"vehicles", "vehicle_model", "sitl", "volume", "geofence"}, infeasible_references),

@@ -13,7 +13,7 @@ from swarmctl.bus.network.hosts import HostParams
 from swarmctl.configuration.sections import LimitParams, SitlParams, StartParams, SwarmParams, VehicleParams
 from swarmctl.control.collision.barrier import BarrierParams
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
-from swarmctl.control.commit.commit_params import planning
+from swarmctl.control.commit.commit_params import CommitParams, planning
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.controllers.pid import PID, PidParams
 from swarmctl.control.model import VehicleModelParams
@@ -61,6 +61,24 @@ def tick_problems(controller: ControllerParams, rate_hz: float) -> Iterator[str]
         factor = f"a factor of {max(dt_s / tick_s, tick_s / dt_s):.2g}"
         off = f"its derivative and its integral would be off by {factor}; set it to {tick_s:.6g}"
         yield f"controller.pid.dt_s = {dt_s:g}: {ticks}: {off}"
+
+
+def horizon_problems(controller: ControllerParams, commit: CommitParams, separation: SeparationParams) -> Iterator[str]:
+    """Yield of which plans inputs would be chosen beyond their end, where nothing comes of them."""
+    mpc, lengths = controller.mpc, list[tuple[str, int, str, int]]()
+    if controller.plans:
+        lengths += [
+            ("controller.mpc.control_z", mpc.control_z, "controller.mpc.horizon_z", mpc.horizon_z),
+            ("controller.mpc.control_xy", mpc.control_xy, "controller.mpc.horizon_xy", mpc.horizon_xy),
+        ]
+    if separation.mode == "guaranteed":
+        lengths.append(("agent.commit.moves", commit.moves, "agent.commit.horizon", commit.horizon))
+    for key, changes, horizon_key, steps in lengths:
+        if changes > steps:
+            yield (
+                f"{key} = {changes}: more than the {steps} steps of a plan, {horizon_key}, after which inputs change"
+                " nothing; lower it to that, or raise the horizon"
+            )
 
 
 def path_sharing_problems(sharing: PathSharingParams, separation: SeparationParams) -> Iterator[str]:

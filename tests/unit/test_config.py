@@ -377,6 +377,32 @@ def test_ways_faster_than_a_vehicle_may_fly_are_refused(key: str) -> None:
     load(None, ["vehicle_model.speed_max_m_s=3", f"{key}=3"])
 
 
+COMMITS = "separation.mode=guaranteed"
+
+
+@pytest.mark.parametrize(
+    ("given", "key", "steps"),
+    [
+        (("controller.mpc.horizon_z=20",), "controller.mpc.control_z", 20),
+        (("controller.mpc.horizon_xy=20",), "controller.mpc.control_xy", 20),
+        (("controller.mpc.horizon_xy=20", "controller.kind=dmpc3"), "controller.mpc.control_xy", 20),
+        ((COMMITS, "agent.commit.horizon=10"), "agent.commit.moves", 10),
+    ],
+)
+def test_inputs_beyond_the_end_of_a_plan_are_refused(given: tuple[str, ...], key: str, steps: int) -> None:
+    """Plans were those with as many as there are steps, at the cost of more, and no more came of a higher number."""
+    (problem,) = refusals(None, *given, f"{key}={steps + 1}")
+    horizon_key = given[0].partition("=")[0] if given[0] != COMMITS else "agent.commit.horizon"
+    assert problem.startswith(f"{key} = {steps + 1}: more than the {steps} steps of a plan, {horizon_key}, ")
+    assert problem.endswith("lower it to that, or raise the horizon")
+    load(None, [*given, f"{key}={steps}"])
+
+
+@pytest.mark.parametrize("given", [("controller.kind=pid", "controller.mpc.horizon_xy=2"), ("agent.commit.moves=40",)])
+def test_a_horizon_that_no_plan_has_is_accepted(given: tuple[str, ...]) -> None:
+    load(None, given)
+
+
 BRAKES = (
     "agent.barrier.brake_m_s2",
     "agent.commit.brake_m_s2",

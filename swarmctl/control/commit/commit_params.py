@@ -19,7 +19,7 @@ class CommitParams(Params):
 
     dt_s: float = Field(0.1, ge=0.05, le=0.5)  # time between two points of a trajectory
     horizon: int = Field(20, ge=5, le=60)  # steps before the final braking
-    moves: int = Field(8, ge=2, le=40)  # control horizon: steps after which the input is constant
+    moves: int = Field(8, ge=2, le=40)  # control horizon: steps after which the input is constant; at most horizon
     brake_m_s2: float = Field(1.5, ge=0.5, le=10)  # deceleration of the final braking
     tilt_fraction_01: float = Field(  # share of the controller's tilt that plans may use; the rest is for tracking
         0.8, gt=0, le=1

@@ -35,9 +35,9 @@ class MpcParams(Params):
     dt_s: float = Field(0.02, gt=0.001, le=0.5)  # time between two points of a plan
     discretisation: Literal["zoh", "euler"] = "zoh"  # euler is the thesis' (3.6)
     thrust_ahead: Literal["held", "planned"] = "held"  # x-y uses the thrust of now (thesis) or of the z plan
-    control_z: int = Field(3, ge=1, le=50)  # free input changes, in steps
+    control_z: int = Field(3, ge=1, le=50)  # free input changes, in steps; at most horizon_z
     horizon_z: int = Field(40, ge=2, le=200)  # predicted steps
-    control_xy: int = Field(6, ge=1, le=50)  # and of dmpc3, for all three axes
+    control_xy: int = Field(6, ge=1, le=50)  # and of dmpc3, for all three axes; at most horizon_xy
     horizon_xy: int = Field(40, ge=2, le=200)  # predicted steps, also those of a shared path
     blocking_xy: Literal["none", "spread"] = "none"  # changes at the first steps (thesis), or over the whole horizon
     z: AxisWeights = AxisWeights(q_pos=2.0, q_vel=0.05, r=1.0)  # thesis r 0.01 leaves x-y no thrust in fast climbs

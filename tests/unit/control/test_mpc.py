@@ -250,6 +250,7 @@ def test_a_solver_that_is_stopped_too_early_has_a_residual() -> None:
 
 @pytest.mark.parametrize("horizon_xy", [2, 6])
 def test_a_control_horizon_as_long_as_the_prediction_can_be_flown(horizon_xy: int) -> None:
+    """A longer one, too: plans that track commitments have ten changes of thrust, however short they are."""
     neighbour = fixed(HERE + np.array([3.0, 0.0, 0.0]), steps=horizon_xy)
     assert plan_to((0.1, 0.0, 0.0), neighbour, horizon_xy=horizon_xy).status is PlanStatus.OK
 
