@@ -226,7 +226,8 @@ class Autopilot:
         self.arrived_us.append(arrived_us)
         number = message_id(frame)
         if number in BOOT_READERS and number != _LOCAL_POSITION:
-            self.clock.witness(number, BOOT_READERS[number](payload).time_boot_ms * 1000, arrived_us)
+            boot_us = self.clock.boot_us(BOOT_READERS[number](payload).time_boot_ms, arrived_us)
+            self.clock.witness(number, boot_us, arrived_us)
         handler = self._handlers.get(number)
         if handler is not None:
             handler(READERS[number](payload), arrived_us)
@@ -306,7 +307,8 @@ class Autopilot:
         if sample is not None and _is_place(message.lat, message.lon):
             place = _geodetic(message.lat, message.lon, message.alt)
             local_us, _, pos, vel = sample[:4]
-            self.frame.seen(place, message.time_boot_ms * 1000, local_us, np.array(pos), vel_ned_m_s=np.array(vel))
+            boot_us = self.clock.boot_us(message.time_boot_ms, arrived_us)
+            self.frame.seen(place, boot_us, local_us, np.array(pos), vel_ned_m_s=np.array(vel))
 
     def _ask_the_time(self, now_us: int) -> None:
         if self.dialect is not None and now_us - self._sync_us >= _SYNC_EVERY_US:

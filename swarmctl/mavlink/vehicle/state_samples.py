@@ -77,7 +77,8 @@ class StateSamples:
     def attitude_quaternion(self, message: Any, arrived_us: int) -> None:
         """Keep an attitude for the local positions that follow."""
         q_nb = message.q1, message.q2, message.q3, message.q4
-        self._attitude = message.time_boot_ms * 1000, q_nb, (message.rollspeed, message.pitchspeed, message.yawspeed)
+        vehicle_us = self._clock.boot_us(message.time_boot_ms, arrived_us)
+        self._attitude = vehicle_us, q_nb, (message.rollspeed, message.pitchspeed, message.yawspeed)
 
     def local_position(self, message: Any, arrived_us: int) -> None:
         """Combine a local position with the newest attitude, for autopilots without ODOMETRY.
@@ -86,7 +87,7 @@ class StateSamples:
         """
         if self._attitude is None or (arrived_us - self._odometry_us < _ODOMETRY_US and self._odometry_us):
             return
-        vehicle_us = message.time_boot_ms * 1000
+        vehicle_us = self._clock.boot_us(message.time_boot_ms, arrived_us)
         attitude_us, q_nb, rate = self._attitude
         if abs(vehicle_us - attitude_us) > _APART_US:
             self._refused["attitude of another time"] += 1

@@ -9,6 +9,9 @@ off ours, and simulated ones also stand still.
 A stamp far in the past, or ahead of what the line allows, is refused. The clock is taken to have restarted only when
 several refused stamps follow and agree with each other, and the vehicle to have rebooted only when the boot time of
 another message agrees with them.
+
+Most messages tell the time since boot in 32 bits of milliseconds, which begin again after 49.7 days. Those that do so
+when the vehicle's clock is expected to be there have only begun another turn.
 """
 
 from __future__ import annotations
@@ -35,6 +38,8 @@ _PATIENCE_US = 3_000_000  # a run this long needs no witness: the vehicle sends 
 _BOUND_SLACK_US = 1_000
 _MOVED_US = 5_000  # a line farther below the bound is older than a stop of the clock; else the bound corrects it
 _UNKNOWN_RATE_US = 200_000  # the same while no rate is known
+_TURN_US = 2**32 * 1000  # after which `time_boot_ms` begins again
+_TURNED_US = 2_000_000  # by which it may then differ from what is expected: later frames wait in links
 _LOOP_US = 4_000  # time an autopilot's loop may take to answer, of what is left between the bounds
 _QUESTIONS = 8  # requests remembered: a second and a half, in which a delay that creeps up gains little
 
@@ -95,6 +100,17 @@ class VehicleClock:
             return None
         return self._line(self._newest_us) - self._one_way_delay_us
 
+    def boot_us(self, boot_ms: int, arrived_us: int) -> int:
+        """Return the time since boot [us] of a `time_boot_ms`, with the turns that it has made."""
+        vehicle_us = boot_ms * 1000
+        if self._newest_us is None:
+            return vehicle_us
+        since_us = arrived_us - self._arrived_us
+        expected_us = self._newest_us + since_us
+        turned_us = vehicle_us + max(0, round((expected_us - vehicle_us) / _TURN_US)) * _TURN_US
+        is_expected = abs(turned_us - expected_us) < _TURNED_US + _EARLY_01 * max(0, since_us)
+        return turned_us if is_expected else vehicle_us
+
     def to_local(self, vehicle_us: int, arrived_us: int) -> int | None:
         """Return the host time of a vehicle stamp that arrived at `arrived_us`; None for a refused stamp."""
         late_us = arrived_us - vehicle_us
@@ -126,6 +142,9 @@ class VehicleClock:
 
     def round_trip(self, asked_us: int, vehicle_us: int, arrived_us: int) -> None:
         """Take an answered TIMESYNC: the vehicle read `vehicle_us` between host times `asked_us` and `arrived_us`."""
+        if self._newest_us is not None:  # turns before the first stamp are in no other message
+            turned_us = vehicle_us - round((vehicle_us - self._newest_us) / _TURN_US) * _TURN_US
+            vehicle_us = turned_us if abs(turned_us - self._newest_us) <= _PAST_US else vehicle_us
         self.witness("TIMESYNC", vehicle_us, arrived_us)
         if self._newest_us is None or abs(vehicle_us - self._newest_us) > _PAST_US or arrived_us < asked_us:
             return  # another time base than the stamps of the state

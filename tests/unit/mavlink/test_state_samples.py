@@ -244,6 +244,39 @@ def test_a_position_is_taken_with_an_attitude_of_its_time(apart_ms: int, is_take
     assert (bench.poll() is not None) == is_taken
 
 
+TURN_US = 2**32 * 1000  # 49.7 days, after which milliseconds of 32 bits begin again
+
+
+def told_since_boot(bench: Bench, seconds: float, booted_us: int) -> Any:
+    """An ArduPilot tells its state for a while, its clock begun at `booted_us`; the last state."""
+    state = None
+    for _ in range(round(seconds * 50)):
+        bench.clock.advance(20_000)
+        stamp_us = (bench.clock.now_us() - booted_us) % TURN_US
+        bench.say(attitude_at(stamp_us))
+        bench.say(position_at(stamp_us))
+        bench.heartbeat(custom_mode=20, autopilot=3)
+        state = bench.poll()
+    return state
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+def test_a_time_since_boot_that_begins_again_is_no_reboot_and_a_reboot_after_it_still_is_one(turns: int) -> None:
+    bench = Bench().ready()
+    booted_us = bench.clock.now_us() + 3_000_000 - turns * TURN_US
+    for _ in range(300):
+        state = told_since_boot(bench, 0.02, booted_us)
+        assert abs(state.t_us - bench.clock.now_us()) < 20_000
+    assert (bench.pilot.clock.boots, bench.pilot.clock.restarts, bench.own_codec.refused.total()) == (0, 0, 0)
+    bench.clock.advance(3_000_000)
+    rebooted_us = bench.clock.now_us()
+    assert told_since_boot(bench, 0.5, rebooted_us) is None, "its local origin is another one now"
+    assert bench.pilot.clock.boots == 1
+    bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
+    assert told_since_boot(bench, 1.0, rebooted_us) is not None
+    assert bench.pilot.clock.boots == 1
+
+
 def test_the_first_position_after_a_reboot_is_not_combined_with_an_attitude_of_before() -> None:
     bench = Bench().ready()
     bench.say(attitude_at(60_000_000, (0.6, 0.0, 0.8, 0.0)))

@@ -230,3 +230,42 @@ def test_round_trips_of_another_time_base_are_ignored() -> None:
     link.clock.round_trip(round(link.now_us), 10**15, round(link.now_us) + 500)
     link.clock.round_trip(round(link.now_us), round(link.vehicle_us), round(link.now_us) - 1)
     assert (link.clock.offset_us, link.clock.answered) == (before, 0)
+
+
+TURN_US = 2**32 * 1000  # 49.7 days, after which `time_boot_ms` begins again
+
+
+@pytest.mark.parametrize(
+    ("since_us", "boot_ms", "found_us"),
+    [
+        (0, 2**32 - 50, TURN_US - 50_000),  # a late one
+        (0, 0, TURN_US),
+        (30_000_000, 29_000, TURN_US + 29_000_000),
+        (30_000_000, 2**32 - 1000 * 1000, TURN_US - 1000 * 1000_000),  # of another time, whose turn can't be known
+        (30_000_000, 3_000_000, 3_000_000_000),  # rebooted
+    ],
+)
+def test_times_since_boot_begin_another_turn_where_it_is_expected(since_us: int, boot_ms: int, found_us: int) -> None:
+    clock, newest_us = VehicleClock(), TURN_US - 10_000
+    assert clock.boot_us(newest_us // 1000, 0) == newest_us, "before the first stamp"
+    clock.to_local(newest_us, 0)
+    assert clock.boot_us(boot_ms, since_us) == found_us
+
+
+def test_a_vehicle_that_was_rebooted_in_its_second_turn_is_seen_to_be() -> None:
+    link = Link(VehicleClock(), 0.99)
+    link.vehicle_us = TURN_US + 3e12
+    link.run(5.0)
+    assert link.clock.answered > 20
+    link.vehicle_us = 1_300_000.0
+    link.run(0.6)
+    assert link.clock.boots == 1
+
+
+def test_round_trips_count_of_a_vehicle_whose_stamps_began_again_before_it_was_heard() -> None:
+    """It answers by a clock of 64 bits."""
+    clock, turned_us = VehicleClock(), 3 * TURN_US
+    for k in range(100):
+        clock.to_local(5_000_000 + 20_000 * k, 20_000 * k)
+    clock.round_trip(1_980_000, turned_us + 6_990_000, 2_000_000)
+    assert clock.answered == 1
