@@ -21,7 +21,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from swarmctl.bus.network.identity_files import AUTHORITY, MOST_BYTES, REVOKED_FILE, certificate_file, key_file
 from swarmctl.bus.network.keyring import read_certificate, revoked_serials
-from swarmctl.errors import ConfigError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import create_private, read_file, replace_bytes
 
 _VALID = timedelta(days=3650)  # a swarm whose certificates expire in the field can't fly
@@ -39,11 +39,13 @@ def make_identities(folder: Path, addresses: Mapping[str, _Ip | None]) -> list[s
         addresses: IP of each computer by name; None for one that nobody connects to.
 
     Raises:
-        ConfigError: a file can't be written or read, there are certificates but not the authority's key, or a
-            computer has an identity for another address.
+        ConfigError: a file can't be read, there are certificates but not the authority's key, or a computer has an
+            identity for another address.
+        StartError: a file can't be written.
     """
     with _reported("keys init", folder):
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with _writing():
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         signer = _authority(folder, may_begin=True)
         made = [name for name in addresses if not (folder / certificate_file(name)).exists()]
         if moved := [name for name in addresses if name not in made and not _is_for(folder, name, addresses[name])]:
@@ -58,7 +60,8 @@ def add_identity(folder: Path, name: str, address: _Ip | None) -> None:
     """Make one identity; the files of one that is revoked may still be there.
 
     Raises:
-        ConfigError: it has one that counts, the authority's key is not there, or a file can't be written or read.
+        ConfigError: it has one that counts, the authority's key is not there, or a file can't be read.
+        StartError: a file can't be written.
     """
     with _reported("keys add", folder):
         authority, key = _authority(folder)
@@ -75,7 +78,8 @@ def revoke_identity(folder: Path, name: str) -> Path:
     Its files go from this folder, so that a new one can be made.
 
     Raises:
-        ConfigError: there is no such identity, the authority's key is not there, or a file can't be written or read.
+        ConfigError: there is no such identity, the authority's key is not there, or a file can't be read.
+        StartError: a file can't be written.
     """
     if name == AUTHORITY or Path(name).name != name:
         raise ConfigError("keys revoke", [f"{name!r}: name one of [[hosts]], or station"])
@@ -91,14 +95,15 @@ def revoke_identity(folder: Path, name: str) -> Path:
             entry = x509.RevokedCertificateBuilder().serial_number(serial).revocation_date(now).build()
             builder = builder.add_revoked_certificate(entry)
         written = builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
-        replace_bytes(folder / REVOKED_FILE, written)
+        with _writing():
+            replace_bytes(folder / REVOKED_FILE, written)
         _remove(folder, name)
     return folder / REVOKED_FILE
 
 
 @contextmanager
 def _reported(verb: str, folder: Path) -> Iterator[None]:
-    """Raise a ConfigError in place of what goes wrong with files."""
+    """Raise a ConfigError in place of what goes wrong with files that are there."""
     try:
         yield
     except OSError as error:
@@ -107,9 +112,25 @@ def _reported(verb: str, folder: Path) -> Iterator[None]:
         raise ConfigError(verb, [f"{folder}: holds a damaged certificate or key: {error}"]) from error
 
 
+@contextmanager
+def _writing() -> Iterator[None]:
+    """Raise a StartError in place of what goes wrong with files that are written; one that is there is another matter.
+
+    Raises:
+        FileExistsError: as before.
+    """
+    try:
+        yield
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise StartError(f"{error.filename}: can't be written: {error.strerror}") from error
+
+
 def _make(folder: Path, name: str, signer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey], ip: _Ip | None) -> None:
     key = ec.generate_private_key(ec.SECP256R1())
-    (folder / key_file(name)).unlink(missing_ok=True)  # one without a certificate, as of a run that was cut off
+    with _writing():
+        (folder / key_file(name)).unlink(missing_ok=True)  # one without a certificate, as of a run that was cut off
     _write(folder, name, _signed(name, key.public_key(), signer, ip), key)
 
 
@@ -121,7 +142,8 @@ def _named(folder: Path) -> str:
 
 def _remove(folder: Path, name: str) -> None:
     for file in (certificate_file(name), key_file(name)):  # the certificate says that both are there
-        (folder / file).unlink(missing_ok=True)
+        with _writing():
+            (folder / file).unlink(missing_ok=True)
 
 
 def _authority(folder: Path, *, may_begin: bool = False) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
@@ -184,9 +206,10 @@ def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.Ellip
     secret = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    create_private(folder / key_file(name), secret)
-    try:
-        create_private(folder / certificate_file(name), certificate.public_bytes(serialization.Encoding.PEM))
-    except BaseException:
-        (folder / key_file(name)).unlink(missing_ok=True)
-        raise
+    with _writing():
+        create_private(folder / key_file(name), secret)
+        try:
+            create_private(folder / certificate_file(name), certificate.public_bytes(serialization.Encoding.PEM))
+        except BaseException:
+            (folder / key_file(name)).unlink(missing_ok=True)
+            raise

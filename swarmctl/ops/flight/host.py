@@ -87,7 +87,8 @@ def make_host_identities(path: Path, overrides: Sequence[str] = ()) -> tuple[Pat
     """Make the missing identities of a configuration's hosts and of its station; returns their folder and names.
 
     Raises:
-        ConfigError: the configuration is invalid or names no hosts or no folder, or files can't be read or written.
+        ConfigError: the configuration is invalid or names no hosts or no folder, or files can't be read.
+        StartError: files can't be written.
     """
     from swarmctl.bus.network.identities import make_identities  # loads cryptography
 
@@ -103,7 +104,8 @@ def add_host_identity(path: Path, name: str, overrides: Sequence[str] = ()) -> P
 
     Raises:
         ConfigError: the configuration is invalid or names no such host or no folder, the host has an identity that
-            counts, or files can't be read or written.
+            counts, or files can't be read.
+        StartError: files can't be written.
     """
     from swarmctl.bus.network.identities import add_identity  # loads cryptography
 
@@ -120,6 +122,7 @@ def revoke_host_identity(path: Path, name: str, overrides: Sequence[str] = ()) -
 
     Raises:
         ConfigError: the configuration is invalid or names no folder, or there is no such identity.
+        StartError: files can't be written.
     """
     from swarmctl.bus.network.identities import revoke_identity  # loads cryptography
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from swarmctl.errors import EXIT_OK, ConfigError
+from swarmctl.errors import EXIT_OK, ConfigError, StartError
 
 _Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a configuration key; repeatable.")
@@ -24,16 +24,18 @@ def keys_new(
     """Write new random keys, each to a new file that only you can read."""
     from swarmctl.mavlink.signing.key_file import write_new_key
 
-    problems = []
+    taken, unwritten = [], []
     for path in files:
         try:
             print(f"{path}: key {write_new_key(path).fingerprint}")
         except FileExistsError:
-            problems.append(f"{path}: exists already, and a vehicle may have that key; give another name")
+            taken.append(f"{path}: exists already, and a vehicle may have that key; give another name")
         except OSError as error:
-            problems.append(f"{path}: can't be written: {error.strerror}")
-    if problems:
-        raise ConfigError("keys new", problems)
+            unwritten.append(f"{path}: can't be written: {error.strerror}. Give another name, or make its folder")
+    if taken:
+        raise ConfigError("keys new", [*taken, *unwritten])
+    if unwritten:
+        raise StartError("\n".join(unwritten))
     return EXIT_OK
 
 

@@ -147,7 +147,7 @@ def test_identities_are_made_after_a_disk_was_full_between_key_and_certificate(
 
     with monkeypatch.context() as patch:
         patch.setattr(identities, "create_private", full)
-        with pytest.raises(ConfigError, match="No space left"):
+        with pytest.raises(StartError, match="No space left"):
             make_host_identities(path)
     folder = own_identity(load(path), STATION).folder
     assert not list(Path(folder).glob("*.key")) if file == "authority.pem" else not Path(folder, "alpha.key").exists()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import re
 import stat
 import sys
 from collections.abc import Callable
@@ -9,12 +11,14 @@ from pathlib import Path
 
 import pytest
 
+from swarmctl.bus.network import identities
 from swarmctl.bus.network.identities import make_identities, revoke_identity
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.signing.key_file import read_key
 from swarmctl.ops import cli
 
 Run = Callable[..., int]
+HOSTS = '[swarm]\nagents = 1\n[[hosts]]\nname = "alpha"\naddress = "127.0.0.1:7447"\nagents = [0]\n'
 VEHICLE = '[sitl]\nenabled = false\n[swarm]\nagents = 1\n[[vehicles]]\nsysid = 1\nurl = "udpin://127.0.0.1:9"\n'
 
 
@@ -47,6 +51,39 @@ def test_new_keys_are_named_by_their_fingerprints_alone(
     assert "folder: can't be written: No such file" in refused, "all at once"
     assert read_key(files[0]).secret == keys[0].secret
     assert (tmp_path / "2.key").exists()
+
+
+def test_keys_whose_folder_takes_none_are_exit_code_3_and_all_are_named(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As of every file that was asked for; 2 is bad usage."""
+    files = [tmp_path / "no" / "0.key", tmp_path / "1.key", tmp_path / "no" / "2.key"]
+    assert run("keys", "new", *map(str, files)) == 3
+    advice = "can't be written: No such file or directory. Give another name, or make its folder"
+    assert capsys.readouterr().err == f"{files[0]}: {advice}\n{files[2]}: {advice}\n"
+    assert files[1].exists()
+
+
+@pytest.mark.parametrize("verb", ["init", "add", "revoke"])
+def test_identities_that_can_not_be_written_are_exit_code_3(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    config = tmp_path / "swarm.toml"
+    config.write_text(f'{HOSTS}[bus]\nidentities = "identities"\n')
+    if verb != "init":
+        assert run("keys", "init", str(config)) == 0
+        assert verb == "revoke" or run("keys", "revoke", str(config), "alpha") == 0
+    capsys.readouterr()
+
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    for name in ("create_private", "replace_bytes"):
+        monkeypatch.setattr(identities, name, full)
+    assert run("keys", verb, str(config), *([] if verb == "init" else ["alpha"])) == 3
+    assert re.fullmatch(
+        r".*identities/\w+\.(key|pem): can't be written: No space left on device\n", capsys.readouterr().err
+    )
 
 
 def test_installing_without_keys_vehicles_or_a_readable_old_key_is_refused(
