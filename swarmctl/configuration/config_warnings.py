@@ -14,6 +14,7 @@ from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.control.phases.trajectories import way_home
 from swarmctl.control.reference.kinds.csv_table import CsvParams
 from swarmctl.control.reference.mission import MissionReference
+from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.goal import REACHED_M
 from swarmctl.core.text import point_text
 from swarmctl.core.types import Array
@@ -25,6 +26,7 @@ _SAMPLES = 2000  # of a mission
 _BEHIND_M = 0.5  # by acceleration that is lacking: short peaks cost less
 _SAME_M = 1e-6  # distances that differ by less are the same but for rounding
 _STEEP_RAD = 0.75  # a real PX4 has yawed at 44 degrees, and had no thrust left at 55
+_FALLS_HARDER = 1.25  # times what a vehicle falls by: 0.3 m of a plan of 0.8 s are not worth a word, 0.6 m are
 _ZERO = np.zeros(1)
 
 
@@ -36,7 +38,8 @@ def config_warnings(config: Config) -> list[str]:
     references = config.mission.references(np.array(config.starts_ned_m()), config.separation.budget.planned_m)
     flown = [text for about in _ABOUT_REFERENCES for text in about(config, references)]
     judged = (*_judged_by_more_than_is_kept(config), *_stand_above_each_other(config))
-    return [*found, *flown, *judged, *_turned_by_steep_tilt(config), *_counts_by_other_ticks(config)]
+    vehicles = (*_turned_by_steep_tilt(config), *_planned_to_fall(config))
+    return [*found, *flown, *judged, *vehicles, *_counts_by_other_ticks(config)]
 
 
 def warning_lines(config: Config) -> list[str]:
@@ -247,6 +250,20 @@ def _turned_by_steep_tilt(config: Config) -> Iterator[str]:
     if config.vehicles and model.heading == "euler" and model.tilt_max_rad > _STEEP_RAD:
         steep = f"vehicle_model.heading = 'euler' with tilt_max_rad = {model.tilt_max_rad:g}"
         yield f"{steep}: a tilt that goes round costs real vehicles yaw, then thrust; set it to 'swing_twist'"
+
+
+def _planned_to_fall(config: Config) -> Iterator[str]:
+    """Yield that plans fall harder than a vehicle whose motors keep turning, which is above where it is expected then.
+
+    A negative bound, as the thesis', counts as none: no rotor pulls.
+    """
+    key, planned_m_s2 = "controller.mpc.thrust_min_m_s2", config.controller.mpc.thrust_min_m_s2
+    least_m_s2, least_01 = max((model.thrust_range_m_s2()[0], model.thrust_min_01) for model in config.vehicle_models)
+    falls_m_s2, has_m_s2 = GRAVITY_M_S2 - max(0.0, planned_m_s2), GRAVITY_M_S2 - least_m_s2
+    if config.controller.plans and falls_m_s2 > _FALLS_HARDER * has_m_s2:
+        falls = f"{key} = {planned_m_s2:g}: plans fall by up to {falls_m_s2:.2f} m/s2"
+        has = f"vehicle_model.thrust_min_01 = {least_01:g} leaves {has_m_s2:.2f}"
+        yield f"{falls}, {has}: the vehicle is above what it has told others. Raise it to {least_m_s2:.2f}"
 
 
 def _counts_by_other_ticks(config: Config) -> Iterator[str]:

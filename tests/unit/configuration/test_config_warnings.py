@@ -227,6 +227,24 @@ def test_nothing_is_said_of_our_own_files(path: Path) -> None:
     assert config_warnings(load(path)) == []
 
 
+FALLS = "vehicle_model.thrust_min_01=0.2"
+
+
+@pytest.mark.parametrize("given", [(), ("controller.kind=dmpc3",), ("controller.mpc.thrust_min_m_s2=-20",)])
+def test_plans_that_fall_harder_than_the_vehicle_are_named(given: tuple[str, ...]) -> None:
+    (said,) = lines(FALLS, *given)
+    bound = "-20" if "controller.mpc.thrust_min_m_s2=-20" in given else "0"
+    assert said == (
+        f"controller.mpc.thrust_min_m_s2 = {bound}: plans fall by up to 9.81 m/s2, vehicle_model.thrust_min_01 = 0.2"
+        " leaves 5.89: the vehicle is above what it has told others. Raise it to 3.92"
+    )
+
+
+@pytest.mark.parametrize("given", [(FALLS, "controller.mpc.thrust_min_m_s2=3.92"), (FALLS, "controller.kind=pid"), ()])
+def test_negative_control_who_falls_as_planned_is_not(given: tuple[str, ...]) -> None:
+    assert lines(*given) == []
+
+
 def begins_at(tmp_path: Path, z_m: float, *overrides: str) -> list[str]:
     path = tmp_path / "up.csv"
     path.write_text(f"t,x,y,z\n0,0,0,{z_m}\n20,1,0,{z_m}\n", encoding="utf-8")
