@@ -1,6 +1,8 @@
 """Preflight: checks packages, ports and vehicle links before a launch, and reports all problems at once.
 
 Free vehicle ports are bound here and passed on, so that no other launch can take them between the check and the flight.
+A vehicle that is spoken to at an address of its own, as behind a router, is claimed for as long as the launch runs: two
+launches there would both get answers, and both command it.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ import importlib.metadata
 import importlib.util
 import re
 import socket
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -39,10 +42,11 @@ class ReservedPorts:
     ports: tuple[int, ...]  # ports of these sockets
     view_port: int  # 0 when telemetry is off
     vehicle_sockets: tuple[socket.socket, ...] = ()  # the simulator's ends of the same links
+    claims: tuple[socket.socket, ...] = ()  # of vehicles by their addresses
 
     def release(self) -> None:
         """Close this process's copies of the sockets; agents keep theirs."""
-        for sock in (*self.sockets, *self.vehicle_sockets):
+        for sock in (*self.sockets, *self.vehicle_sockets, *self.claims):
             sock.close()
 
 
@@ -54,6 +58,7 @@ def inspect(config: Config, agents: Sequence[int]) -> ReservedPorts:
     """
     problems = list(_package_problems(config))
     sockets: tuple[socket.socket, ...] = ()
+    claims: list[socket.socket] = []
     count = len(agents)
     if config.sitl.enabled:
         if importlib.util.find_spec("sitl") is None:
@@ -63,7 +68,7 @@ def inspect(config: Config, agents: Sequence[int]) -> ReservedPorts:
         except StartError as error:
             problems.append(str(error))
     else:
-        problems += _vehicle_problems(config, agents)
+        problems += _vehicle_problems(config, agents, claims)
     view_port = _view_port(config.telemetry.port) if config.telemetry.enabled else 0
     if config.telemetry.enabled and not view_port:
         problems.append(
@@ -71,7 +76,13 @@ def inspect(config: Config, agents: Sequence[int]) -> ReservedPorts:
             "choose another or set telemetry.enabled = false"
         )
     ports = tuple(sock.getsockname()[1] for sock in sockets[:count])
-    reserved = ReservedPorts(sockets=sockets[:count], ports=ports, view_port=view_port, vehicle_sockets=sockets[count:])
+    reserved = ReservedPorts(
+        sockets=sockets[:count],
+        ports=ports,
+        view_port=view_port,
+        vehicle_sockets=sockets[count:],
+        claims=tuple(claims),
+    )
     if problems:
         reserved.release()
         raise StartError("\n".join(problems))
@@ -110,7 +121,8 @@ def _view_port(first: int) -> int:
         return port
 
 
-def _vehicle_problems(config: Config, agents: Sequence[int]) -> Iterator[str]:
+def _vehicle_problems(config: Config, agents: Sequence[int], claims: list[socket.socket]) -> Iterator[str]:
+    """Yield why links to vehicles can't be used; what is claimed of vehicles is added to `claims`."""
     for agent in agents:
         vehicle = config.vehicles[agent]
         endpoint = parse_url(vehicle.url)
@@ -125,6 +137,28 @@ def _vehicle_problems(config: Config, agents: Sequence[int]) -> Iterator[str]:
                 yield f"{key}: {error}"
         else:
             try:
-                socket.getaddrinfo(endpoint.where, endpoint.number, socket.AF_INET, socket.SOCK_DGRAM)
+                found = socket.getaddrinfo(endpoint.where, endpoint.number, socket.AF_INET, socket.SOCK_DGRAM)
             except OSError as error:
                 yield f"{key}: {endpoint.where} has no address: {error}; check the host"
+                continue
+            claim = _claimed(f"{found[0][4][0]}:{endpoint.number} {vehicle.sysid}")
+            if claim is not None:
+                claims.append(claim)
+            elif sys.platform == "linux":
+                yield f"{key}: another launch on this computer flies the vehicle of sysid {vehicle.sysid} there; end it"
+
+
+def _claimed(vehicle: str) -> socket.socket | None:
+    """Return what claims a vehicle until it is closed, at the latest as this process ends; None where it is taken.
+
+    It is a name of Linux' abstract namespace, which leaves no file and is the network's: one of each namespace.
+    """
+    if sys.platform != "linux":
+        return None
+    claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        claim.bind(f"\0swarmctl vehicle {vehicle}")
+    except OSError:
+        claim.close()
+        return None
+    return claim

@@ -7,6 +7,7 @@ import io
 import json
 import signal
 import socket
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -110,6 +111,23 @@ def test_vehicle_links_are_tried(tmp_path: Path, url: str, word: str) -> None:
         preflight.inspect(vehicles(tmp_path, url), (0,))
     assert "vehicles.0.url" in str(caught.value)
     assert url in str(caught.value)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="claims are names of Linux' abstract namespace")
+@pytest.mark.parametrize("scheme", ["udpout", "tcp"])
+def test_no_second_launch_flies_a_vehicle_that_is_reached_by_its_address(tmp_path: Path, scheme: str) -> None:
+    """As behind a MAVLink router, which answers both."""
+    (free,) = preflight.claim_ports(1)
+    with free:
+        port = free.getsockname()[1]
+    config = vehicles(tmp_path, f"{scheme}://127.0.0.1:{port}")
+    others = config.vehicles[0].model_copy(update={"sysid": 2})
+    ground = preflight.inspect(config, (0,))
+    with pytest.raises(StartError, match=rf"vehicles\.0\.url = .*:{port}': another launch .* of sysid 1 there; end it"):
+        preflight.inspect(vehicles(tmp_path, f"{scheme}://localhost:{port}"), (0,))
+    preflight.inspect(config.model_copy(update={"vehicles": (others,)}), (0,)).release()
+    ground.release()
+    preflight.inspect(config, (0,)).release()
 
 
 def test_a_good_vehicle_port_is_left_free(tmp_path: Path) -> None:
