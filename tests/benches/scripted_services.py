@@ -82,6 +82,7 @@ class ScriptedServices(Services):
         self.said: list[str] = []
         self.interrupts = 0
         self.silent: set[int] = set()
+        self.down: tuple[int, ...] = ()  # agents of other computers, as the last step has said
         self.orders: list[str] = []
         self.boot_ids = [1 for _ in agents]  # of the processes that are heard
         self.ended: list[EndedMessage] = []  # as the first agent has received them
@@ -102,6 +103,9 @@ class ScriptedServices(Services):
 
     def announce_clock(self) -> None:
         return
+
+    def announce_down(self, agents: tuple[int, ...]) -> None:
+        self.down = agents
 
     def restart_router(self) -> None:
         self.children[ROUTER] = Child(Command(ROUTER, (sys.executable, "-ESc", self.router)), self.directory)

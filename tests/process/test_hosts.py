@@ -195,7 +195,7 @@ def a_stop_of_one_host_lands_its_agents_alone(path: Path) -> None:
 
 
 def who_has_landed_with_a_host_that_has_ended_does_not_fail_an_order_to_land_all(path: Path) -> None:
-    """Nobody repeats any more that it has landed, and the station has heard it."""
+    """Nobody repeats any more that it has landed; the station has heard it, and the other host, which has operators."""
     with started(path) as start:
         alpha, bravo, station = start("alpha"), start("bravo"), start("station")
         alpha.until_phase("TRACK", 1)
@@ -204,7 +204,9 @@ def who_has_landed_with_a_host_that_has_ended_does_not_fail_an_order_to_land_all
         assert bravo.end() == 4, bravo.text()
         held = station.verb("hold", "1")
         assert held.returncode == 4
-        landed = station.verb("land")
+        for asked in (station, alpha):
+            assert "has ended, its vehicle is on the ground" in asked.verb("status").stdout
+        landed = alpha.verb("land")
         assert (landed.returncode, "agent-0 accepts" in landed.stdout) == (0, True), landed.stderr
         assert "agent-1: it has ended, its vehicle is on the ground" in landed.stdout
         assert (alpha.end(), station.end()) == (130, 4), station.text()

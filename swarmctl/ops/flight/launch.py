@@ -30,7 +30,7 @@ from swarmctl.configuration.config_warnings import launch_warning_lines
 from swarmctl.core.json_safe import to_json
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.flight.summary import sum_up
-from swarmctl.ops.orders.operator import list_keepers
+from swarmctl.ops.orders.operator import ends_heard, list_keepers
 from swarmctl.ops.preflight import LOOPBACK, ReservedPorts, inspect
 from swarmctl.ops.processes import (
     ROUTER,
@@ -377,9 +377,9 @@ class Launcher(Services):
         context = self.context
         senders = [agent_name(agent) for agent in range(self._config.swarm.agents)]
         listen: dict[Topic, Sequence[str]] = {STATUS: senders, OBSTACLES: list_keepers(context.identity)}
+        listen[ENDED] = tuple(ends_heard(context.identity))
         if not context.agents:  # nobody records here, so the station does
             listen[TICK] = listen[EVENT] = senders
-            listen[ENDED] = () if context.identity is None else context.identity.roster.hosts
         router = self.children[ROUTER]
         deadline_s = time.monotonic() + _BUS_S
         while True:

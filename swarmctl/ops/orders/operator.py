@@ -83,6 +83,14 @@ def vouchers(launch: RunningLaunch) -> Mapping[str, Set[int]]:
     return {speaker.name: frozenset(speaker.agents) for speaker in launch.identity.roster.speakers if speaker.agents}
 
 
+def ends_heard(identity: OwnIdentity | None) -> Mapping[str, Set[int]]:
+    """Return of which agents a computer hears from which other one that they have ended."""
+    if identity is None:
+        return {}
+    others = (speaker for speaker in identity.roster.speakers if speaker.name != identity.name)
+    return {other.name: frozenset(other.agents) for other in others if other.agents}
+
+
 class GoneAgents:
     """Knows who has ended and left its vehicle on the ground, disarmed, as its supervisor says again and again.
 

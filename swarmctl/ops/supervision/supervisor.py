@@ -20,11 +20,12 @@ from swarmctl.core.operator_verbs import Order
 from swarmctl.core.text import counted
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
-from swarmctl.ops.orders.operator import list_setters
+from swarmctl.ops.orders.operator import ends_heard, list_setters
 from swarmctl.ops.orders.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.supervision.bus_report import BusReport
 from swarmctl.ops.supervision.ended_processes import EndedProcesses
+from swarmctl.ops.supervision.ends_elsewhere import EndsElsewhere
 from swarmctl.ops.supervision.hearing import Hearing
 from swarmctl.ops.supervision.landing_order import LandingOrder, is_landing
 from swarmctl.ops.supervision.launch_result import LaunchResult, why_it_failed
@@ -73,6 +74,10 @@ class Services:
         """Publish the clock to the operator's commands again, where it was corrected."""
         raise NotImplementedError
 
+    def announce_down(self, agents: tuple[int, ...]) -> None:
+        """Publish to the operator's commands which agents have ended with their vehicles down."""
+        raise NotImplementedError
+
     def restart_router(self) -> None:
         """Start the router again; the sessions of everybody find it."""
         raise NotImplementedError
@@ -97,6 +102,7 @@ class FlightSupervisor:
         self._viewer_watch = ViewerWatch(services.children.get(VIEWER), self._announce, services.announce)
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
         self._ended = EndedProcesses(self._bus)
+        self._ends_elsewhere = EndsElsewhere(ends_heard(services.context.identity))
         self._report = BusReport(self._bus, services.log.write, display)
         self._obstacles = ObstacleKeeper(
             self._bus,
@@ -180,6 +186,7 @@ class FlightSupervisor:
         for status in self._report.statuses():
             view = next((view for view in self._views if view.agent == status.agent), None)
             if view is None:  # of another computer
+                self._ends_elsewhere.hear(status, time.monotonic())
                 continue
             if view.status is None or view.status.phase != status.phase:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
@@ -191,6 +198,7 @@ class FlightSupervisor:
                 self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + left_s)
             may_be_armed = status.phase < Phase.GOTO_LAND or status.armed  # a stop on the ground passes LAND, too
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE and may_be_armed
+        self._ends_elsewhere.receive(self._report)
         adopted = self._obstacles.receive()
         for adoption in adopted:
             text = f"{counted(len(adoption.after.obstacles), 'obstacle')}, set by an operator"
@@ -305,6 +313,7 @@ class FlightSupervisor:
         now_s = time.monotonic()
         self._obstacles.repeat()
         self._services.announce_clock()
+        self._services.announce_down(self._ends_elsewhere.down(now_s))
         self._ended.repeat()
         if self._landing.is_to_be_said(now_s):
             self._repeat_land_order(self._landing.since_s(now_s))
