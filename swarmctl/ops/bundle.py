@@ -25,7 +25,7 @@ from swarmctl.check.scan.link_facts import VehicleFacts
 from swarmctl.check.scan.scanner import run_scans
 from swarmctl.config import Config, load_recorded
 from swarmctl.configuration.sections import MavlinkParams
-from swarmctl.errors import ConfigError, StartError
+from swarmctl.errors import StartError
 from swarmctl.files import replaced
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.ops.vehicles.vehicle_links import open_links
@@ -63,13 +63,13 @@ def bundle(options: BundleOptions) -> Bundle:
 
     Raises:
         ConfigError: it is no run folder, or the archive is a file that the run has recorded.
-        StartError: the archive can't be written.
+        StartError: the archive can't be written; nothing is downloaded where that is known before.
     """
     config, folder = load_recorded(options.folder), options.folder.resolve()
     output = options.output or folder.with_name(f"{folder.name}.zip")
     refuse_as_output(output, folder, ".zip")
     if not output.resolve().parent.is_dir():  # before logs are downloaded, which takes minutes
-        raise ConfigError("--output", [f"{output}: its folder does not exist; make it first"])
+        raise StartError(f"{output}: its folder does not exist. Choose another with --output")
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)
     try:
         with ended_cleanly, tempfile.TemporaryDirectory(prefix="swarm-bundle-") as scratch:

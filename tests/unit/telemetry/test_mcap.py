@@ -75,7 +75,7 @@ def test_a_file_dated_before_1980_is_bundled(folder: Path, tmp_path: Path) -> No
 
 
 def test_what_can_not_be_bundled_is_refused_in_words(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="its folder does not exist"):
+    with pytest.raises(StartError, match=r"run\.zip: its folder does not exist\. Choose another with --output"):
         bundle(BundleOptions(folder=folder, output=tmp_path / "none" / "run.zip"))
     odd = Path(os.fsdecode(os.fsencode(shutil.copytree(folder, tmp_path / "odd")) + b"/\xff.txt"))
     odd.write_text("")
