@@ -283,7 +283,7 @@ class Agent:
         self._vehicle_watch.report_loss(now_us)
         self._vehicle_watch.report_unheard(now_us)
         if state is not None:
-            self._own_state.update(state, autopilot.hover_thrust_01, controls=self._mission.had_control)
+            self._own_state.update(state, autopilot.own_hover_01, controls=self._mission.had_control)
         return state
 
     def _decide(self, now_us: int, state: VehicleState | None, planning: PlanningResult) -> Plan | None:

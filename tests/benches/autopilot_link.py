@@ -16,6 +16,7 @@ from swarmctl.mavlink.vehicle.autopilot import Autopilot
 SHARED = GeoOrigin(47.397742, 8.545594, 489.4)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 PX4_OFFBOARD, PX4_HOLD, PX4_LAND = 6 << 16, 4 << 16 | 3 << 24, 4 << 16 | 6 << 24
+PX4_TAKEOFF = 4 << 16 | 2 << 24
 
 
 class Bench:

@@ -93,3 +93,15 @@ def test_negative_control_without_its_parts_it_does_not(without: tuple[str, ...]
 def test_negative_control_a_disturbance_that_walks_slower_lags_behind() -> None:
     slow = errors(*WIND, *HEAVY, *GUSTS, "agent.state_filter.disturbance_m_s2=0.2")
     assert slow.rmse_m > 0.05
+
+
+@pytest.mark.parametrize("mass_scale", [0.7, 1.4])
+def test_a_vehicle_of_another_mass_keeps_its_height_as_it_is_taken_over(mass_scale: float) -> None:
+    overrides = ("swarm.agents=1", "mission.kind=hover", "mission.duration_s=4", "start.positions_ned_m=[[0,0,0]]")
+    flight = Lockstep(load(None, (*overrides, f"sitl.mass_scale={mass_scale}", "sitl.physics_hz=100")))
+    flight.run(lambda now: now.mission_is_over())
+    ticks, truth = flight.logs[0].ticks, flight.truth
+    began_us = ticks["t_us"][ticks["phase"] > Phase.TAKEOFF][0]
+    down_m = truth["pos_ned_m"][(truth["t_us"] > began_us) & (truth["t_us"] < ticks["t_us"][-1]), 2]
+    assert flight.logs[0].rows[-1]["phase"][0] > Phase.TRACK
+    assert np.abs(down_m).max() <= 0.2  # of 0.15 that count as arrived

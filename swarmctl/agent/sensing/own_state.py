@@ -12,6 +12,7 @@ from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.types import Array, FlightMode, VehicleState
 
 _AUTOPILOT_HOVER_MODES = (FlightMode.HOLD, FlightMode.EXTERNAL)  # ArduCopter takes off by itself in the latter
+_BRAKES_01 = 0.05  # share by which thrust may be less than hovering takes at the end of a climb, while it slows down
 
 
 class OwnState:
@@ -55,8 +56,12 @@ class OwnState:
             return
         self._taken_us = state.t_us
         self._estimator.update(state, self._thrust_01 if controls else None)
-        if not controls and hover_thrust_01 is not None and state.mode in _AUTOPILOT_HOVER_MODES:
-            self._estimator.learn_hover(hover_thrust_01 * float(body_z_ned(state.q_nb)[2]))
+        if controls or hover_thrust_01 is None:
+            return
+        level_01 = hover_thrust_01 * float(body_z_ned(state.q_nb)[2])
+        differs_01 = abs(level_01 / self.estimate.hover_thrust_01 - 1.0)
+        if state.mode in _AUTOPILOT_HOVER_MODES or (state.mode is FlightMode.TAKEOFF and differs_01 > _BRAKES_01):
+            self._estimator.learn_hover(level_01)
 
     def start(self, state: VehicleState, act_us: int, *, controls: bool) -> Start:
         """Return where a plan begins whose first setpoint acts at `act_us`."""

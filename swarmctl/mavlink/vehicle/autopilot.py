@@ -260,6 +260,8 @@ class Autopilot:
 
     def _extended(self, message: Any, arrived_us: int) -> None:
         self.landed = Landed(message.landed_state) if message.landed_state <= Landed.LANDING else Landed.UNKNOWN
+        if self.landed is Landed.ON_GROUND:
+            self._has_climbed = self._ends_climb = False
 
     def _statustext(self, message: Any, arrived_us: int) -> None:
         text = message.text.rstrip("\t\x00") if isinstance(message.text, str) else str(message.text)
@@ -292,9 +294,15 @@ class Autopilot:
         self.landed, self.armable, self.health = Landed.UNKNOWN, False, VehicleHealth()
         self.params, self.whole_params = {}, set()
         self.hover_thrust_01 = self.pos_accuracy_m = None
+        self._has_climbed = self._ends_climb = False  # in its present take-off
         self._gps_sigma_m = 0.0
         self._unaided = 0  # reports in a row of an estimator that knows no position
         self.frame.forget()
+
+    @property
+    def own_hover_01(self) -> float | None:
+        """Return `hover_thrust_01`, None during a take-off that has not shown it yet."""
+        return self.hover_thrust_01 if self.mode is not FlightMode.TAKEOFF or self._ends_climb else None
 
     # -- frame, clock, accuracy, parameters ---------------------------------------------------------------------------
 
@@ -354,17 +362,24 @@ class Autopilot:
             self.hover_thrust_01 = value
 
     def _attitude_target(self, message: Any, arrived_us: int) -> None:
-        """Note which setpoint is flown; learn the hover thrust in HOLD, or where take-off shares our mode."""
+        """Note which setpoint is flown; learn the hover thrust where the autopilot hovers by itself."""
         self.setpoints.heard.repeated(message.thrust, arrived_us)
-        if self.landed is Landed.IN_AIR and 0.05 < message.thrust < 1.0 and self._hovers_by_itself(arrived_us):
+        if 0.05 < message.thrust < 1.0 and self._hovers_by_itself(arrived_us):
             self.hover_thrust_01 = message.thrust
 
     def _hovers_by_itself(self, now_us: int) -> bool:
+        """Return whether it hovers, in HOLD, where take-off shares our mode, or at the end of a climb."""
         sample, setpoint_us = self.states.newest, self.setpoints.sent_us
-        if self.mode is not FlightMode.EXTERNAL or sample is None:
-            return self.mode is FlightMode.HOLD
+        if self.mode is FlightMode.HOLD or sample is None:
+            return self.mode is FlightMode.HOLD and self.landed is Landed.IN_AIR
+        down_m_s = float(sample.vel_ned_m_s[2])
+        if self.mode is FlightMode.TAKEOFF and self.landed is not Landed.ON_GROUND:
+            self._has_climbed |= down_m_s < -_HOVER_M_S  # before, its rotors spin up
+            self._ends_climb = self._has_climbed and abs(down_m_s) < _HOVER_M_S
+            return self._ends_climb
         own = setpoint_us is None or now_us - setpoint_us > _OWN_FLIGHT_US
-        return own and abs(sample.vel_ned_m_s[2]) < _HOVER_M_S
+        in_ours = self.mode is FlightMode.EXTERNAL and self.landed is Landed.IN_AIR
+        return in_ours and own and abs(down_m_s) < _HOVER_M_S
 
 
 def _is_place(lat_e7: int, lon_e7: int) -> bool:

@@ -15,7 +15,7 @@ from swarmctl.config import load
 from swarmctl.control.controllers.discovery import make_controller
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
-from swarmctl.core.types import Array, Plan, Reference
+from swarmctl.core.types import Array, FlightMode, Plan, Reference
 from tests import builders
 
 STEP_S = 0.02
@@ -68,3 +68,13 @@ def test_a_vehicle_with_drag_flies_what_is_planned_along_its_reference(filtered:
     assert np.linalg.norm(pos - [399 * STEP_S * SPEED_M_S, 0.0, -5.0]) < 0.02
     planned = ticks[-41][1].pos_ned_m[40]
     np.testing.assert_allclose(pos, planned, atol=0.02)
+
+
+@pytest.mark.parametrize(("thrust_01", "within_01"), [(0.49, 0.0), (0.65, 0.06), (0.35, 0.06)])
+def test_the_end_of_a_climb_tells_a_hover_thrust_that_is_far_off(thrust_01: float, within_01: float) -> None:
+    setup = assembly._setup_of(load(None, ["swarm.agents=1"]), 0, 1, {})
+    own = OwnState(setup.vehicle_model, make_estimator(setup))
+    for tick in range(50):
+        own.update(builders.vehicle_state(t_us=20_000 * tick, mode=FlightMode.TAKEOFF), thrust_01, controls=False)
+    learned = thrust_01 if within_01 else HOVER_01  # a vehicle that slows down takes a little less than to hover
+    assert own.estimate.hover_thrust_01 == pytest.approx(learned, rel=within_01, abs=0.0)

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import development as dialect
 from swarmctl.core.types import AttitudeSetpoint, FlightMode, Landed
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.transport import PipeTransport
-from tests.benches.autopilot_link import LEVEL, PX4_HOLD, PX4_LAND, PX4_OFFBOARD, SHARED, Bench, odometry
+from tests.benches.autopilot_link import LEVEL, PX4_HOLD, PX4_LAND, PX4_OFFBOARD, PX4_TAKEOFF, SHARED, Bench, odometry
 
 
 def test_no_state_before_mode_origin_and_position_are_all_known() -> None:
@@ -494,6 +494,29 @@ def test_hover_thrust_is_the_parameters_until_the_vehicle_hovers_by_itself() -> 
     bench.say(dialect.MAVLink_attitude_target_message(0, 0, list(LEVEL), 0.0, 0.0, 0.0, 0.8))
     bench.poll()
     assert bench.pilot.hover_thrust_01 == pytest.approx(0.36), "an echo of ours says nothing"
+
+
+def test_hover_thrust_is_learned_where_a_climb_ends() -> None:
+    bench = Bench()
+    bench.heartbeat(PX4_TAKEOFF)
+    bench.say(dialect.MAVLink_param_value_message(b"MPC_THR_HOVER", 0.5, 9, 1, 0))
+
+    def target(landed: int, down_m_s: float, thrust_01: float) -> float | None:
+        bench.say(dialect.MAVLink_extended_sys_state_message(0, landed))
+        bench.clock.advance(20_000)
+        bench.say(odometry(bench.clock.now_us(), vel=(0.0, 0.0, down_m_s)))
+        bench.poll()
+        bench.say(dialect.MAVLink_attitude_target_message(0, 0, list(LEVEL), 0.0, 0.0, 0.0, thrust_01))
+        bench.poll()
+        return bench.pilot.own_hover_01
+
+    on_ground, taking_off = 1, 3
+    assert target(on_ground, 0.0, 0.1) is None
+    assert target(taking_off, -0.1, 0.2) is None, "its rotors spin up"
+    assert target(taking_off, -0.8, 0.7) is None, "it climbs"
+    assert target(taking_off, -0.1, 0.61) == pytest.approx(0.61)
+    assert target(on_ground, 0.0, 0.1) is None
+    assert target(taking_off, 0.0, 0.2) is None, "the next take-off"
 
 
 def test_only_answers_to_own_timesyncs_count() -> None:
