@@ -19,7 +19,9 @@ SPEED_M_S = 3.0
 BEGIN_NED_M, END_NED_M = [25.0, 0.0, -5.0], [25.0, 0.5, -5.0]  # of the reference, 25 m from the start
 
 
-def fly_there(fly: Fly, speed_max_m_s: float, mode: str, from_ned_m: Sequence[float] = (0.0, 0.0, -3.0)) -> Flight:
+def fly_there(
+    fly: Fly, speed_max_m_s: float, mode: str, *overrides: str, from_ned_m: Sequence[float] = (0.0, 0.0, -3.0)
+) -> Flight:
     return fly(
         "swarm.agents=1",
         "sitl.start=air",
@@ -29,6 +31,7 @@ def fly_there(fly: Fly, speed_max_m_s: float, mode: str, from_ned_m: Sequence[fl
         f"mission.waypoints.lists=[{{points_ned_m=[{BEGIN_NED_M},{END_NED_M}]}}]",
         f"vehicle_model.speed_max_m_s={speed_max_m_s}",
         f"separation.mode={mode}",
+        *overrides,
         until=lambda running: phase(running) > Phase.TRACK,
     )
 
@@ -76,9 +79,9 @@ def test_negative_control_without_a_limit_of_sinking_it_falls_into_the_ground(
     assert lowest_m(fly) < 0.0
 
 
-def past_it_m(fly: Fly, mode: str) -> float:
+def past_it_m(fly: Fly, mode: str, *overrides: str) -> float:
     """Fly to a reference that stands 30 m away; return how far the vehicle gets beyond it."""
-    flight = fly_there(fly, 100.0, mode, from_ned_m=(-5.0, 0.0, -5.0))
+    flight = fly_there(fly, 100.0, mode, *overrides, from_ned_m=(-5.0, 0.0, -5.0))
     return float(flight.pos_ned_m[:, 0, 0].max()) - BEGIN_NED_M[0]
 
 
@@ -91,3 +94,8 @@ def test_who_comes_fast_does_not_fly_past_its_reference(fly: Fly, mode: str) -> 
 def test_negative_control_plans_alone_brake_too_late(fly: Fly, mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(approach, "_NEARLY", 100.0)
     assert past_it_m(fly, mode) > 3.0
+
+
+def test_who_weighs_distances_more_does_not_fly_past_its_reference_either(fly: Fly) -> None:
+    heavy = [f"controller.mpc.{axis}.q_pos=15" for axis in "xy"]
+    assert past_it_m(fly, "best_effort", *heavy) < 0.5

@@ -19,7 +19,9 @@ from swarmctl.core.types import Array
 _FAR_S = 0.8  # at the largest speed: what is nearer is braked for
 _LEAST_SINK_M_S = 0.3  # however little thrust is left
 _OF_BRAKING = 0.85  # share of the largest deceleration with which speeds fall on the way
-_BRAKED_IN_TIME = 3.0  # times `_FAR_S` of deceleration: the speed from which plans stop by themselves; from 4 too late
+_BRAKED_IN_TIME = 3.0  # times `_FAR_S` of deceleration: the most speed from which plans stop by themselves
+_LEAST_BRAKED_S = 1.2  # of deceleration: what is as near is reached as weights have it, as in the thesis
+_OF_STOPPING = 0.85  # share of the speed from which plans brake too late
 _NEARLY = 0.9  # share of the speed on the way from which on it is told
 
 
@@ -36,7 +38,9 @@ class Approach:
         accel_max_m_s2 = mpc.accel_max_m_s2(vehicle)
         self._speed_max_m_s, self._brake_m_s2 = vehicle.speed_max_m_s, _OF_BRAKING * accel_max_m_s2
         self._sink_max_m_s = max(_LEAST_SINK_M_S, _FAR_S * (mpc.most_thrust_m_s2(vehicle) - GRAVITY_M_S2))
-        near_s = _BRAKED_IN_TIME * min(_FAR_S, mpc.horizon_xy * mpc.dt_s)
+        horizon_s = min(_FAR_S, mpc.horizon_xy * mpc.dt_s)
+        by_weights_s = max(_LEAST_BRAKED_S, _OF_STOPPING * _stopped_s(mpc, horizon_s))
+        near_s = min(_BRAKED_IN_TIME * horizon_s, by_weights_s)
         self._near_m_s = accel_max_m_s2 * near_s
         self._near_m = 0.5 * self._near_m_s * near_s / _OF_BRAKING if plans else math.inf
 
@@ -86,3 +90,15 @@ class Approach:
         braked_s = np.minimum(ahead_s, closing_m_s / self._brake_m_s2)
         left_m = away_m - (closing_m_s - 0.5 * self._brake_m_s2 * braked_s) * braked_s
         return left_m, closing_m_s - self._brake_m_s2 * braked_s
+
+
+def _stopped_s(mpc: MpcParams, horizon_s: float) -> float:
+    """Return the longest time of full braking that plans begin by themselves where it has to begin.
+
+    Of plans that brake by a for their horizon T, from a distance d at a speed v, the cheapest has, by the weights q of
+    distance and speed (r aside), a (q_pos T^5 / 20 + q_vel T^3 / 3) = q_vel v T^2 / 2 + q_pos (v T^4 / 8 - d T^3 / 6).
+    With v = a s and d = v^2 / 2a, s is the larger root of s^2 / 2 - b s + c = 0.
+    """
+    slows = min(weights.q_vel / weights.q_pos for weights in (mpc.x, mpc.y))
+    b, c = 0.75 * horizon_s + 3.0 * slows / horizon_s, 0.3 * horizon_s**2 + 2.0 * slows
+    return b + math.sqrt(max(0.0, b * b - 2.0 * c))  # no root: plans always brake a little too late

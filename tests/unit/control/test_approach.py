@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.mpc_params import MpcParams
+from swarmctl.control.mpc.mpc_params import AxisWeights, MpcParams
 from swarmctl.control.reference.approach import Approach
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array
@@ -116,3 +116,12 @@ def test_who_brakes_is_told_no_more_than_a_vehicle_may_fly_and_sink(
 def test_what_brakes_by_the_distance_that_is_left_is_told_that() -> None:
     """A PID that followed speeds instead flew 30 m past its goal."""
     assert np.array_equal(braked(*STANDS, plans=False)[0], STANDS[0])
+
+
+@pytest.mark.parametrize(("q_vel", "brakes"), [(0.5, False), (0.05, True), (0.0, True)])
+def test_who_weighs_speed_little_is_told_to_brake_sooner(q_vel: float, brakes: bool) -> None:
+    weights = AxisWeights(q_pos=1.5, q_vel=q_vel, r=0.01)
+    approach = Approach(MpcParams(x=weights, y=weights), VehicleModelParams(), plans=True)
+    pos, vel = away(4.0, 4.0, 4.0, along=NORTH), np.zeros((3, 3))
+    found_m, _ = approach.reference(pos, vel, AHEAD_S, own_ned_m=OWN_NED_M, own_ned_m_s=4.0 * NORTH)
+    assert np.array_equal(found_m, pos) is not brakes
