@@ -44,6 +44,8 @@ from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, received_file, ticks_file
 
 _TAIL_S = 120.0  # time allowed before and after the mission, and beyond what ends by itself
+_SINKS_M_S = 0.1  # of vehicles that land, at least: another one rests, or is flown by a pilot
+_LANDS_M_S = 0.5  # of autopilots that land, at least
 _TRUTH_EVERY_US = 20_000
 _OBSTACLES_EVERY_US = 1_000_000
 _WHOLE = 1e-6  # by which a number of steps may differ from a whole one
@@ -276,9 +278,17 @@ class Lockstep:
                 return
 
     def _ends_in_s(self) -> float:
-        """Return until when agents do what ends by itself, such as a long way back; 0 where nobody does."""
+        """Return until when agents do what ends by itself, such as a long way back or down; 0 where nobody does."""
         left_s = [agent.ends_in_s for agent in self.agents if agent is not None]
+        left_s += [self._lands_in_s(i) for i, agent in enumerate(self.agents) if agent is not None]
         return max((seconds for seconds in left_s if seconds > 0.0), default=0.0)
+
+    def _lands_in_s(self, index: int) -> float:
+        """Return how long a vehicle that its autopilot lands may still sink; 0 where it does not."""
+        rows, truth = self.logs[index].rows, self.world.truth_rows()[index]
+        lands = bool(rows) and rows[-1]["phase"][0] == Phase.LAND and truth["vel_ned_m_s"][2] > _SINKS_M_S
+        height_m = self.config.sitl.ground_z_m - float(truth["pos_ned_m"][2])
+        return height_m / _LANDS_M_S if lands and self.config.sitl.start == "ground" else 0.0
 
 
 def _steps_per_tick(config: Config) -> int:

@@ -143,6 +143,16 @@ def test_a_long_way_back_is_flown_to_its_end() -> None:
     assert lockstep.clock.now_us() > 150_000_000
 
 
+def test_a_long_way_down_is_flown_to_its_end() -> None:
+    """Two minutes after the mission one that had begun 90 m up was still sinking, "did not finish"."""
+    high = ("mission.kind=hover", "mission.duration_s=1", "start.center_ned_m=[0, 0, -100]")
+    waits = "agent.state_machine.start_timeout_s=200"
+    lockstep = Lockstep(load(None, ("swarm.agents=1", "sitl.physics_hz=50", "agent.rate_hz=10", *high, waits)))
+    lockstep.run()
+    assert lockstep.problems() == []
+    assert lockstep.clock.now_us() > 121_000_000
+
+
 def test_the_bus_in_memory_drops_who_is_not_reached_after_the_configured_lease() -> None:
     flight = Lockstep(load(None, ["swarm.agents=2", "bus.lease_ms=700"]))
     flight.hub.fail()
