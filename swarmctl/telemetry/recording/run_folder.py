@@ -16,7 +16,7 @@ from swarmctl.core.recorded.stored_column import StoredColumn, dtype_of
 from swarmctl.core.recorded.tick_record import COLUMNS
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.files import is_held, replace_text, write_each
+from swarmctl.files import replace_text, write_each
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate, flown_without
 from swarmctl.telemetry.evaluation.tracks import flight_rows
 from swarmctl.telemetry.recording.file_names import (
