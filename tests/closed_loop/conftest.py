@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.conditions.layouts import nudged
 from swarmctl.config import Config, load
-from swarmctl.control.estimation.accuracy import AccuracyMonitor
-from swarmctl.control.failsafe.overload import Readiness
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Mode, Phase
 from swarmctl.simulator_config import SimulatorConfig
+from tests.benches.early_starts import as_launched, begun_early
 
 ROOT = Path(__file__).parents[2]
 # Physics of campaigns (`sitl.studies.campaign.flight.PHYSICS_HZ`), by which the airframes of `_ALIKE` fly as they do by
@@ -158,37 +157,16 @@ def closer_than(bound_m: float) -> Callable[[Lockstep], bool]:
 
 
 _as_configured = Config.simulator
-_unsettled, _unmet = AccuracyMonitor.unsettled, Readiness.unmet
-_EXACT_M, _KNOWN_US = 0.02, 200_000
 
 
-def unsettled_but_exact(monitor: AccuracyMonitor, now_us: int) -> str:
-    """Return what has to happen before an accuracy can be used that ever was worse than an exact estimator's."""
-    is_exact = bool(monitor._claims) and max(claim_m for _, claim_m in monitor._claims) <= _EXACT_M
-    return "" if is_exact and now_us - monitor._claims[0][0] >= _KNOWN_US else _unsettled(monitor, now_us)
-
-
-def unmet_but_idle(readiness: Readiness, now_us: int, missed_01: float) -> str:
-    """Return what to wait for where any deadline was missed of late."""
-    told, since_us = _unmet(readiness, now_us, missed_01), readiness._since_us
-    is_idle = missed_01 == 0.0 and since_us is not None and now_us - since_us >= _KNOWN_US
-    return "" if is_idle else told
-
-
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def early_starts() -> Iterator[None]:
-    """Begin flights 4 s sooner where all that vehicles would wait for on the ground is time.
-
-    An exact estimator's figure changes by centimetres, which its tolerance allows for, and in lockstep no deadline is
-    missed unless a test wants it. Who waits and why is tested in tests/unit; most flights here take less than 20 s.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(AccuracyMonitor, "unsettled", unsettled_but_exact)
-        patch.setattr(Readiness, "unmet", unmet_but_idle)
+    """Begin flights sooner, and no longer than these tests: others of the same process judge what vehicles wait for."""
+    with begun_early():
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def nudged_starts(request: pytest.FixtureRequest) -> Iterator[None]:
     """Shift the vehicles of every flight by up to a millimetre, by the seed of `--nudged`."""
     seed = int(request.config.getoption("--nudged"))
@@ -211,8 +189,7 @@ def configured_starts(nudged_starts: None, early_starts: None, monkeypatch: pyte
     claim has to hold from all of them, its control has to fail from one.
     """
     monkeypatch.setattr(Config, "simulator", _as_configured)
-    monkeypatch.setattr(AccuracyMonitor, "unsettled", _unsettled)
-    monkeypatch.setattr(Readiness, "unmet", _unmet)
+    as_launched(monkeypatch)
 
 
 @pytest.fixture
@@ -220,7 +197,7 @@ def fly() -> Fly:
     return fly_now
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def circle() -> Flight:
     """Fly the whole default mission."""
     return fly_now(FINE)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.estimation.accuracy import AccuracyLoss, AccuracyMonitor
+from swarmctl.control.failsafe.overload import Readiness
 
 SECOND = 1_000_000
 PX4_AFTER_BOOT_S, PX4_CLAIM_M = [1.2, 2.2, 4.2, 9.0, 30.0], [14.1, 0.010, 0.073, 0.285, 0.290]
@@ -82,3 +83,9 @@ def test_only_an_estimate_that_gets_worse_dead_reckons() -> None:
     assert loss.dead_reckoning_s == 3.0
     loss.update(3 * SECOND, 0.5, is_standing=False)
     assert loss.dead_reckoning_s == 0.0, "it has a fix"
+
+
+def test_what_is_judged_here_is_the_program() -> None:
+    """Flights of tests/closed_loop begin early in the same process, before these tests."""
+    assert AccuracyMonitor.unsettled.__module__ == AccuracyMonitor.__module__
+    assert Readiness.unmet.__module__ == Readiness.__module__
