@@ -40,7 +40,7 @@ def test_a_dead_agent_lands_and_the_others_keep_clear(fly: Fly) -> None:
         others = [log.rows[-1]["phase"][0] for log in running.logs[::2] if log.rows]
         return has_landed(running, 1) and min(others) > Phase.TRACK
 
-    flight = fly("mission.duration_s=8", at={5.0: lambda running: running.kill(1)}, until=over)
+    flight = fly(*COARSE, "mission.duration_s=8", at={5.0: lambda running: running.kill(1)}, until=over)
     assert landed_by_itself(flight.lockstep.truth, 1)
     assert flight.separation_m() >= 0.85
     assert flight.outcomes == {"completed"}, "of the others"
@@ -169,7 +169,7 @@ def others_are_done(running: Lockstep) -> bool:
 
 def test_a_pilot_override_is_respected(fly: Fly) -> None:
     landing = {5.0: take_over, 6.5: lambda running: running.command("land")}
-    flight = fly("mission.duration_s=11", AIR, at=landing, until=others_are_done)
+    flight = fly(*COARSE, "mission.duration_s=11", AIR, at=landing, until=others_are_done)
     ticks = flight.ticks(2)
     overridden = ticks["mode"] == Mode.PILOT_OVERRIDE
     assert overridden.any()
@@ -238,7 +238,7 @@ def test_others_keep_clear_of_an_agent_without_a_solver(fly: Fly) -> None:
     broken = {
         at_s: partial(break_solver, agent=0, lasts_s=lasts_s) for at_s, lasts_s in ((3.0, 0.3), (4.5, 2.0), (8.5, 8.0))
     }
-    flight = fly("mission.duration_s=14.5", at=broken)
+    flight = fly(*COARSE, "mission.duration_s=14.5", at=broken)
     assert {Mode.REPLAY, Mode.BRAKE, Mode.HOLD, Mode.LAND} <= flight.modes(0)
     assert flight.separation_m() >= 0.85
     assert all(landed_by_itself(flight.lockstep.truth, agent) for agent in range(3))
@@ -267,6 +267,7 @@ def test_operator_holds_resumes_and_lands(fly: Fly) -> None:
         speeds[len(speeds)] = float(np.linalg.norm(running.logs[0].rows[-1]["vel_ned_m_s"][0]))
 
     flight = fly(
+        *COARSE,
         "swarm.agents=2",
         "mission.duration_s=20",
         at={

@@ -17,6 +17,7 @@ from tests.closed_loop.test_interest import to_goals
 
 COMMITTED_M = 0.85
 FAR = (
+    *COARSE,
     "separation.mode=guaranteed",
     "agent.path_sharing.far_hz=4",
     "agent.path_sharing.speed_m_s=2.2",
@@ -123,7 +124,7 @@ def gone_on_m() -> float:
     goals = [[-45.0, -3.0, -3.0], [-45.0, 3.0, -3.0], [40.0, -6.0, -3.0], [40.0, 6.0, -3.0]]
     others = frozenset(map(agent_name, range(3)))
     flight = fly_now(
-        *(*FAR, *COARSE, "sitl.start=air", "swarm.agents=4", "mission.kind=goto", "mission.duration_s=60"),
+        *(*FAR, "sitl.start=air", "swarm.agents=4", "mission.kind=goto", "mission.duration_s=60"),
         f"start.positions_ned_m={json.dumps(starts)}",
         f"mission.goto.goals_ned_m={json.dumps(goals)}",
         at={3.0: lambda running: running.hub.split([frozenset({agent_name(3)}), others])},

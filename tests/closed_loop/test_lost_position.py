@@ -12,7 +12,7 @@ from swarmctl.agent.planning.coordination import Coordination
 from swarmctl.control.estimation import accuracy
 from swarmctl.core.types import Landed
 from swarmctl.mavlink.vehicle import autopilot
-from tests.closed_loop.conftest import Flight, Fly, closer_than
+from tests.closed_loop.conftest import COARSE, Flight, Fly, closer_than
 from tests.closed_loop.test_handover import COPTER
 
 AT_S = 3.0
@@ -20,9 +20,10 @@ LANDED_M = 4.0  # from where it took off: lost 6 s, until the estimator has said
 SEPARATION_M = 0.85
 TOO_CLOSE_M = 0.6
 ENDED_S = 40.0  # start 14 s, loss 3 s, braking 4 s, landing 9 s; waiting for room lasts 20 s
-ALONE = ("swarm.agents=1", "mission.kind=hover", "mission.duration_s=40")
+ALONE = (*COARSE, "swarm.agents=1", "mission.kind=hover", "mission.duration_s=40")
 # It drifts towards the peer 1.2 m away, who gives way by what the estimator has told by then.
 BESIDE = (
+    *COARSE,
     "swarm.agents=2",
     "mission.kind=hover",
     "mission.duration_s=15",
@@ -116,7 +117,7 @@ def test_negative_control_commitments_are_relied_on_whose_tube_leaves_out_the_es
 
 
 def test_all_who_have_lost_gps_land_soon_though_none_finds_room(fly: Fly) -> None:
-    flight = fly_without_gps(fly, ("mission.duration_s=60",), lost=3)
+    flight = fly_without_gps(fly, (*COARSE, "mission.duration_s=60"), lost=3)
     assert all(outcome.startswith("no GPS for") for outcome in flight.outcomes)
     assert not flight.lockstep.world.truth_rows()["armed"].any()
     assert flight.t_s[-1] < ENDED_S
