@@ -110,7 +110,7 @@ def sunken_in_wind(wind_m_s: float, towards_deg: float) -> tuple[float, str]:
 
     settings = ("swarm.agents=1", "mission.duration_s=10", f"sitl.wind.mean_ned_m_s=[{north:.3f},{east:.3f},0]")
     over = Lockstep.mission_is_over
-    flight = fly_now("sitl.start=air", *settings, config=X500.name, at={4.0: note_alert}, until=over)
+    flight = fly_now(*COARSE, "sitl.start=air", *settings, config=X500.name, at={4.0: note_alert}, until=over)
     _, error_ned_m = flight.tracked(0)
     return float(error_ned_m[:, 2].max()), "" if told[0] is None else told[0].text
 
@@ -132,6 +132,7 @@ def drifted_in_hold_m() -> float:
     blows = "sitl.faults=[{kind='wind',vehicle=0,at_s=20,value=7,towards_deg=0}]"
     climbs = ("sitl.start=air", "swarm.agents=1", "mission.duration_s=60", "mission.circle.climb_ned_m_s=-0.6", blows)
     flight = fly_now(
+        *COARSE,
         *climbs,
         "controller.mpc.thrust_max_m_s2=12.5",
         config=X500.name,

@@ -90,7 +90,7 @@ class Watched:
         return agent
 
     def step_for(self, seconds: float) -> None:
-        for _ in range(round(seconds * 50)):
+        for _ in range(max(1, round(seconds * self.run.config.agent.rate_hz))):
             self.run.step()
             truth = self.run.world.truth_rows()[0]
             if truth["armed"] and truth["flight_mode"] == FlightMode.EXTERNAL:
@@ -265,7 +265,7 @@ def test_arducopter_is_flown_in_its_own_dialect_until_a_pilot_chooses_another_mo
 
 def given_back_and_never_obeyed() -> tuple[Watched, list[int]]:
     """A flight whose autopilot hears no request for another mode since `resume`, and when these were sent."""
-    flight = Watched(*COPTER).until_mission(4.0)
+    flight = Watched(*COPTER, *COARSE).until_mission(4.0)
     loiter = mavlink.MAVLink_command_long_message(1, 1, 176, 0, 1.0, 5.0, 0, 0, 0, 0, 0)
     link, reader, asked_us = flight.run.links[0][0], Codec(255, 190), list[int]()
     PipeTransport.send(link, reader.encode(loiter))

@@ -19,11 +19,11 @@ from swarmctl.core.operator_verbs import BEGIN, MISSION
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
 from swarmctl.ops.orders.mission_file import mission_message, mission_order
-from tests.closed_loop.conftest import AT_100_HZ
+from tests.closed_loop.conftest import COARSE
 from tests.closed_loop.test_operator import fly_for, fly_until, outcome, phase
 
 HOVER = (
-    AT_100_HZ,
+    *COARSE,
     "swarm.agents=2",
     "start.positions_ned_m=[[0,0,-3],[4,0,-3]]",
     "mission.kind=hover",
@@ -205,7 +205,7 @@ def test_a_mission_below_the_ground_is_refused_where_only_the_vehicle_knows_the_
         f"waypoints.lists = [{{ points_ned_m = {points} }}]\n"
     )
     alone = (
-        AT_100_HZ,
+        *COARSE,
         "swarm.agents=1",
         "start.positions_ned_m=[[0,0,-3]]",
         "mission.kind=hover",
@@ -223,7 +223,7 @@ def test_a_mission_below_the_ground_is_refused_where_only_the_vehicle_knows_the_
 def test_a_mission_on_whose_way_the_fence_is_left_is_refused(tmp_path: Path) -> None:
     """The fence has two arms; the mission is in the other one."""
     fence = "geofence.corners_ne_m=[[-3,-3],[20,-3],[20,3],[3,3],[3,20],[-3,20]]"
-    place = (AT_100_HZ, "swarm.agents=1", "start.positions_ned_m=[[12,0,-3]]", "mission.kind=hover", "sitl.start=air")
+    place = (*COARSE, "swarm.agents=1", "start.positions_ned_m=[[12,0,-3]]", "mission.kind=hover", "sitl.start=air")
     flight = Lockstep(load(None, (*place, "mission.duration_s=60", fence)))
     fly_until(flight, lambda: phase(flight, 0) is Phase.TRACK)
     for goal, reasons in (("[12.0, 2.0, -3.0]", []), ("[0.0, 14.0, -3.0]", ["on the way is outside of the geofence"])):

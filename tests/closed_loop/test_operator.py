@@ -13,7 +13,7 @@ from swarmctl.config import load
 from swarmctl.control.phases import departure
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import ControlMode, Phase
-from tests.closed_loop.conftest import AT_100_HZ, COARSE, ROOT
+from tests.closed_loop.conftest import COARSE, ROOT
 
 ON_GROUND_ALONE = (*COARSE, "swarm.agents=1", "mission.duration_s=1")
 
@@ -87,7 +87,7 @@ def test_the_fence_of_the_configuration_is_that_of_goto() -> None:
 @pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
 def test_an_agent_goes_to_a_point_through_the_others_and_resume_continues_the_mission(mode: str) -> None:
     """Agent 0 crosses the place of agent 1, which hovers on the straight way between."""
-    hover = (AT_100_HZ, "mission.kind=hover", "mission.duration_s=7", "sitl.start=air", f"separation.mode={mode}")
+    hover = (*COARSE, "mission.kind=hover", "mission.duration_s=7", "sitl.start=air", f"separation.mode={mode}")
     starts = "start.positions_ned_m=[[0,0,-5],[2,0,-5]]"
     flight = Lockstep(load(None, ("swarm.agents=2", starts, *hover)))
     target = np.array([4.0, 0.0, -5.0])

@@ -18,7 +18,7 @@ import {first}
 import hashlib
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
-flight = Lockstep(load(None, ["sitl.start=air"]))
+flight = Lockstep(load(None, ["sitl.start=air", "sitl.physics_hz=100"]))
 while flight.clock.now_us() < {until_us}:
     flight.step()
 print(hashlib.sha256(flight.truth.tobytes()).hexdigest())
