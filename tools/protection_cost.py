@@ -25,6 +25,7 @@ from unittest import mock
 import psutil
 
 from sitl.lockstep import Lockstep
+from sitl.studies.bench.free_ports import free_ports
 from swarmctl.agent.agent import Agent
 from swarmctl.bus.bus import Bus, Subscriptions, agent_name
 from swarmctl.bus.local.hub import LocalHub
@@ -41,7 +42,6 @@ from swarmctl.core.recorded.tick_record import TickRecord
 from swarmctl.core.types import Phase
 from swarmctl.mavlink.signing.key_file import write_new_key
 from swarmctl.wall_clock import WallClock
-from tests.benches.free_ports import free_ports
 from tests.benches.sealed_hub import SealedHub
 
 CONFIG = Path(__file__).parents[1] / "configs" / "three_hosts.toml"

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.benches.free_ports import free_ports
+from sitl.studies.bench.free_ports import free_ports
 
 ROOT = Path(__file__).resolve().parents[2]
 SPEED = 4  # simulated seconds a second: what clients wait for is flight

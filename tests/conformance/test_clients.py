@@ -21,10 +21,10 @@ import pymavlink.dialects.v20 as dialects
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
+from sitl.studies.bench.free_ports import free_ports
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import message_id
 from swarmctl.process_priority import request_realtime
-from tests.benches.free_ports import free_ports
 from tests.conformance import vocabulary as v
 from tests.conformance.dialogue import Dialogue
 from tests.conformance.partners import InProcess

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benches.free_ports import free_ports
+from sitl.studies.bench.free_ports import free_ports
 from tests.process.test_check import ENV, Simulator
 
 pytestmark = pytest.mark.process

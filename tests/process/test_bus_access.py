@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from sitl.studies.bench.free_ports import free_ports
 from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.datagram_links import bind_datagrams, datagram_address
 from swarmctl.bus.network.datagram_routes import DatagramRoutes
@@ -28,7 +29,6 @@ from swarmctl.bus.topics import COMMAND, ENDED, EVENT, MISSION, OBSTACLES, PATH,
 from swarmctl.bus.zenoh.bus import ZenohBus
 from swarmctl.bus.zenoh.client import SCHEME
 from swarmctl.errors import StartError
-from tests.benches.free_ports import free_ports
 from tests.benches.swarm_of_hosts import LOOPBACK, LOOPBACK_6, Ip, SwarmOfHosts
 
 pytestmark = pytest.mark.process

@@ -19,6 +19,7 @@ import psutil
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
+from sitl.studies.bench.free_ports import free_ports
 from swarmctl.config import load
 from swarmctl.errors import StartError
 from swarmctl.mavlink.codec import Codec
@@ -26,7 +27,6 @@ from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.signing.key_file import write_new_key
 from swarmctl.ops.vehicles.key_install import install
 from swarmctl.ops.vehicles.vehicle_check import CheckOptions, check
-from tests.benches.free_ports import free_ports
 
 pytestmark = pytest.mark.process
 

@@ -15,6 +15,7 @@ import pytest
 import zenoh
 
 import swarmctl.bus.zenoh.client as zenoh_client
+from sitl.studies.bench.free_ports import free_ports
 from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.identities import make_identities
 from swarmctl.bus.network.identity_files import STATION
@@ -23,7 +24,6 @@ from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.topics import COMMAND, PATH, STATUS
 from swarmctl.bus.zenoh.bus import ZenohBus
 from swarmctl.errors import StartError
-from tests.benches.free_ports import free_ports
 from tests.benches.router_process import start_router
 from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
 from tests.process.test_bus import end

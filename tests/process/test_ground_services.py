@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
+from sitl.studies.bench.free_ports import free_ports
 from swarmctl.check.ground_services import GroundServices, GroundVehicle, open_services
 from swarmctl.check.scan.listener import open_listener
 from swarmctl.check.scan.scanner import VehicleScan, run_scans
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.transport import bind_udp
 from swarmctl.wall_clock import monotonic_us
-from tests.benches.free_ports import free_ports
 from tests.process.test_check import Simulator
 
 pytestmark = pytest.mark.process

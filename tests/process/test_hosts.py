@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sitl.studies.bench.free_ports import free_ports
 from swarmctl.core.recorded.records import TRUTH_COLUMNS
 from swarmctl.ops.cli import main
 from swarmctl.telemetry.recording.file_names import PACKED_TRUTH
 from swarmctl.telemetry.recording.run_files import read_parquet
 from tests.benches.at_once import at_once
-from tests.benches.free_ports import free_ports
 from tests.benches.launches import READY_S, Launched
 from tests.process.test_bus import until
 from tests.process.test_readme import shown

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from sitl.studies.bench.free_ports import free_ports
 from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.identities import make_identities
 from swarmctl.bus.network.identity_files import STATION
@@ -22,7 +23,6 @@ from swarmctl.ops.orders.operator import list_keepers, list_setters
 from swarmctl.ops.running_launches import RunningLaunch
 from swarmctl.ops.supervision.obstacle_keeper import ObstacleKeeper, adoption_text
 from swarmctl.wall_clock import WallClock
-from tests.benches.free_ports import free_ports
 from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
 from tests.process.test_bus import until
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from sitl.studies.bench.free_ports import free_ports
 from swarmctl.bus.bus import Bus
 from swarmctl.bus.network.identities import make_identities
 from swarmctl.bus.network.identity_files import STATION
@@ -20,7 +21,6 @@ from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, STATUS
 from swarmctl.bus.zenoh.bus import ZenohBus
 from swarmctl.bus.zenoh.client import CLOSE_DEADLINE_S, SCHEME
 from swarmctl.bus.zenoh.session import SharedSession, ZenohSession
-from tests.benches.free_ports import free_ports
 from tests.benches.router_process import start_router
 from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
 from tests.process.test_bus import end, endpoint, until  # noqa: F401  (a fixture)

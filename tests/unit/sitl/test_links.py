@@ -16,8 +16,8 @@ from sitl.net.ports import OpenPort
 from sitl.net.tcp import serve_tcp
 from sitl.px4.modes import Px4Mode
 from sitl.px4.parameters import REAL32
+from sitl.studies.bench.free_ports import free_ports
 from swarmctl.mavlink.transport import bind_udp
-from tests.benches.free_ports import free_ports
 from tests.benches.px4_bench import COARSE, SPAWN_NED_M, Bench
 
 BEAT, ACK, TEXT, VALUE = 0, 77, 253, 22
