@@ -12,7 +12,7 @@ import pytest
 
 from swarmctl.control.reference import approach
 from swarmctl.core.types import Phase
-from tests.closed_loop.conftest import Flight, Fly
+from tests.closed_loop.conftest import COARSE, Flight, Fly
 from tests.closed_loop.test_operator import phase
 
 SPEED_M_S = 3.0
@@ -23,6 +23,7 @@ def fly_there(
     fly: Fly, speed_max_m_s: float, mode: str, *overrides: str, from_ned_m: Sequence[float] = (0.0, 0.0, -3.0)
 ) -> Flight:
     return fly(
+        *COARSE,
         "swarm.agents=1",
         "sitl.start=air",
         f"start.positions_ned_m=[{list(from_ned_m)}]",

@@ -17,6 +17,7 @@ from tests.closed_loop.conftest import COARSE, ROOT, Fly
 from tests.closed_loop.test_operator import fly_until, least_m, outcome, phase, vehicle
 
 HOVER = (  # two metres apart, seven above the ground
+    *COARSE,
     "swarm.agents=3",
     "start.positions_ned_m=[[0,0,-5],[2,0,-5],[-2,0,-5]]",
     "mission.kind=hover",
