@@ -31,8 +31,9 @@ ROOT = Path(__file__).parents[2]
 AT_100_HZ = "sitl.physics_hz=100"
 _ALIKE = ("thesis", "crazyflie")
 FINE = "sitl.physics_hz=250"  # as configured: for accuracy, and where a docstring gives figures of further flights
-# Half the work, for claims of messages, phases and equality, where the negative control still fails so. Those of
-# test_guaranteed.py don't; accuracy and distances kept are flown at the configured rate.
+# Half the work, for claims of messages, phases, equality, and of reactions that take seconds, where the claim holds so
+# from shifted starts too, and the negative control still fails. Those of test_guaranteed.py don't; accuracy, and the
+# distances that shipped configurations keep, are flown at the configured rate.
 COARSE = ("agent.rate_hz=25", AT_100_HZ)
 
 
