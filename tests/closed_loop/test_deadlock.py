@@ -16,7 +16,7 @@ from swarmctl.config import load
 from swarmctl.control.reference.kinds import goto
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array
-from tests.closed_loop.conftest import AT_100_HZ, COARSE
+from tests.closed_loop.conftest import AT_100_HZ
 
 SMALL = (  # bodies of 15 cm that keep 30 cm
     "sitl.preset=crazyflie",
@@ -125,7 +125,7 @@ UNDAMPED = "controller.mpc.proximal_xy=0"
 
 
 def ten_to_one_point(*sets: str) -> Flown:
-    flown = Flown(layout_of("same_goal", 8, 10).starts_ned_m, np.zeros((1, 3)), 6.5, *COARSE, *sets)
+    flown = Flown(layout_of("same_goal", 8, 10).starts_ned_m, np.zeros((1, 3)), 6.5, *sets)
     assert flown.separation_m > 0.85
     return flown
 
