@@ -104,6 +104,14 @@ def test_negative_control_without_the_rule_they_do_not_get_by() -> None:
     assert flown.distance_m.min() > 1.0
 
 
+def test_two_exactly_above_each_other_swap_heights_in_space() -> None:
+    """With `dmpc3` they stood in front of each other for good: no plan led sideways."""
+    heights = np.array([[0.0, 0.0, -3.0], [0.0, 0.0, -8.0]])
+    flown = Flown(heights, heights[::-1], 8.0, "controller.kind=dmpc3")
+    assert flown.distance_m.max() < ARRIVED_M
+    assert flown.separation_m > 0.85
+
+
 TRIANGLE = ring(3, 3.0, 0.0)
 
 

@@ -13,6 +13,7 @@ from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.types import Array
 
 _TINY_M = 1e-6  # nearer centres have no direction
+_ABOVE_01 = 0.02  # level part of a normal (at most) between agents that are above each other
 _SWING_M = 0.05  # approach that needs no more room: agents of a formation, kept apart for it, would swing the more
 
 
@@ -147,7 +148,8 @@ def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: A
     head-on both give way to the left. Obstacles are passed on the side the agent is on. `angle_rad` (keep-outs, Hp)
     is the largest turn: full for obstacles, for peers only when the own plan is stuck, because turned normals would
     also keep a swarm that shares one goal from closing in evenly. `to_goal` (keep-outs, Hp, axes) is what is left to
-    fly with regard to the keep-out: one that moves towards an agent at its goal is passed as well, not fled from.
+    fly with regard to the keep-out: one that moves towards an agent at its goal is passed as well, not fled from. Of
+    two exactly above each other, for which there is no clockwise, the lower one gives way to the north.
     """
     if not angle_rad.any():
         return normal
@@ -159,4 +161,8 @@ def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: A
     turned = normal.copy()
     turned[:, :, 0] = c * normal[:, :, 0] - s * normal[:, :, 1]
     turned[:, :, 1] = s * normal[:, :, 0] + c * normal[:, :, 1]
+    if normal.shape[2] == 3:
+        above = np.hypot(normal[:, :, 0], normal[:, :, 1]) < _ABOVE_01
+        turned[above, 0] += s[above] * normal[above, 2]
+        turned[above, 2] *= c[above]
     return turned

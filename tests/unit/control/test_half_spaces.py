@@ -102,7 +102,7 @@ def test_downwash_takes_as_long_to_stop_from_above() -> None:
         spaces = half_spaces(
             [keep_out],
             still((0.0, 0.0, -3.0)),
-            np.zeros(3),
+            np.array([0.0, 0.0, -3.0]),
             np.array([0.0, 0.0, 2.8]),
             dt_s=0.1,
             own_priority_id=0,
@@ -191,6 +191,21 @@ def test_stuck_head_on_agents_turn_to_opposite_sides() -> None:
         pos_ned_m=still((2.0, 0.0, 0.0)), priority_id=-1
     )  # obstacles do not evade: always turned
     assert abs(spaces_of(moving, obstacle, goal=(5.0, 0.0)).normal[0, 0, 1]) > 0.3
+
+
+def test_of_two_stuck_above_each_other_the_lower_one_turns_to_the_north() -> None:
+    lower, upper, beside = (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.03, -1.0)
+
+    def first(own: tuple[float, float, float], other: tuple[float, float, float], goal_z_m: float) -> Array:
+        peer = builders.keep_out(pos_ned_m=still(other))
+        normal: Array = in_space(still(own), peer, goal=(0.0, 0.0, goal_z_m)).normal[0, 0]
+        return normal
+
+    c, s = math.cos(0.35), math.sin(0.35)
+    np.testing.assert_allclose(first(lower, upper, -5.0), [s, 0.0, c], atol=1e-9)
+    np.testing.assert_allclose(first(upper, lower, 4.0), [-s, 0.0, -c], atol=1e-9)
+    assert first(lower, upper, 5.0) == pytest.approx([0.0, 0.0, 1.0]), "it flies away"
+    assert first(lower, beside, -5.0)[2] > 0.999, "it is not exactly below"
 
 
 @pytest.mark.parametrize("axes", [2, 3])
@@ -369,7 +384,7 @@ def test_in_space_the_stopping_row_includes_vertical_speed() -> None:
     assert sinking.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
     assert sinking.stop_offset_m[0] == pytest.approx(0.9)
     rising_other = builders.keep_out(pos_ned_m=line((0.0, 0.0, 0.0), (0.0, 0.0, -1.0)))  # 1 m/s up
-    spaces = in_space(still((0.0, 0.0, -3.0)), rising_other)
+    spaces = in_space(still((0.0, 0.0, -3.0)), rising_other, goal=(0.0, 0.0, -3.0))
     assert spaces.stop_s[0] == pytest.approx(1.0 / 2.8)
     assert spaces.stop_offset_m[0] == pytest.approx(1.0 + 0.9 + 1.0 / 2.8)  # -z: where it is then, and the radius
 
