@@ -241,7 +241,37 @@ def _seen_too_late(config: Config, references: Sequence[MissionReference]) -> It
                 break
 
 
-_ABOUT_REFERENCES = (_begin_elsewhere, _cut_short, _same_goals, _swings_out, _left_behind, _seen_too_late)
+def _kept_apart_by_nobody(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
+    """Yield whose references meet others, or obstacles, under a controller that keeps clear of neither."""
+    if config.controller.keeps_clear or config.separation.mode == "guaranteed":
+        return
+    t_s, limit_m, found = np.linspace(0.0, config.mission.duration_s, _SAMPLES), config.limits.min_separation_m, []
+    flown = [reference.sample(t_s)[0] for reference in references]
+    for (i, a), (j, b) in itertools.combinations(enumerate(flown), 2):
+        near_m = float(np.linalg.norm(a - b, axis=1).min())
+        if near_m < limit_m - _SAME_M:
+            fails = f"the flight fails below limits.min_separation_m = {limit_m:g}"
+            found.append(f"the references of agents {i} and {j} come to {near_m:.2f} m, and {fails}")
+    for number, obstacle in enumerate(config.obstacles):
+        center_ned_m = obstacle.center_after(t_s[:, None])
+        for agent, pos_ned_m in enumerate(flown):
+            away_m = np.linalg.norm((pos_ned_m - center_ned_m)[:, : obstacle.axes], axis=1)
+            if away_m.min() < obstacle.keep_out_m - config.limits.obstacle_margin_m - _SAME_M:
+                found.append(f"the reference of agent {agent} leads into the keep_out_m of obstacles.{number}")
+    keeps = f"controller.kind = {config.controller.kind!r} keeps clear of nothing but a touch"
+    fix = "fly 'dmpc', separation.mode = 'guaranteed', or elsewhere"
+    yield from _first([f"{keeps}: {text}; {fix}" for text in found], "references meet others or obstacles")
+
+
+_ABOUT_REFERENCES = (
+    _begin_elsewhere,
+    _cut_short,
+    _same_goals,
+    _swings_out,
+    _left_behind,
+    _seen_too_late,
+    _kept_apart_by_nobody,
+)
 
 
 def _turned_by_steep_tilt(config: Config) -> Iterator[str]:

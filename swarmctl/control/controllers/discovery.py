@@ -44,6 +44,11 @@ class ControllerParams(Params):
         return not self.is_own and CONTROLLERS[self.kind].follows_reference
 
     @property
+    def keeps_clear(self) -> bool:
+        """Tell whether plans of the controller keep clear of peers and obstacles; an own one's are certified to."""
+        return self.is_own or CONTROLLERS[self.kind].keeps_clear
+
+    @property
     def keeps_volume(self) -> bool:
         """Tell whether plans of the controller stay in a flight volume; an own one's are certified to."""
         return self.is_own or self.plans

@@ -45,4 +45,5 @@ class ControllerKind(Generic[P]):
     params: type[P]
     make: Callable[[P, ControllerSetup], Controller]
     plans: bool = True  # false: `u_max` does not bound it, and it flies out of a flight volume
+    keeps_clear: bool = True  # false: of peers and obstacles; only the safety filter does
     follows_reference: bool = True  # false: another one flies to the start and to the landing place

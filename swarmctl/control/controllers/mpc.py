@@ -22,4 +22,4 @@ class SingleMpc(SwarmMpc):
         return super().plan(replace(problem, keep_outs=()))
 
 
-MPC = ControllerKind(name="mpc", section="mpc", params=MpcParams, make=SingleMpc)
+MPC = ControllerKind(name="mpc", section="mpc", params=MpcParams, make=SingleMpc, keeps_clear=False)

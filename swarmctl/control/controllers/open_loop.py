@@ -35,5 +35,11 @@ class OpenLoop:
 
 
 OPEN_LOOP = ControllerKind(
-    name="open_loop", section="mpc", params=MpcParams, make=OpenLoop, plans=False, follows_reference=False
+    name="open_loop",
+    section="mpc",
+    params=MpcParams,
+    make=OpenLoop,
+    plans=False,
+    keeps_clear=False,
+    follows_reference=False,
 )

@@ -98,5 +98,10 @@ class PidController:
 
 
 PID = ControllerKind(
-    name="pid", section="pid", params=PidParams, make=lambda params, _: PidController(params), plans=False
+    name="pid",
+    section="pid",
+    params=PidParams,
+    make=lambda params, _: PidController(params),
+    plans=False,
+    keeps_clear=False,
 )
