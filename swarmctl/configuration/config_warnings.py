@@ -168,7 +168,7 @@ def _judged_by_more_than_is_kept(config: Config) -> Iterator[str]:
         yield from _first(list(_certified_inside(config)), "obstacles are certified to be flown into")
         return
     budget, limit_m = config.separation.budget, config.limits.min_separation_m
-    if budget.committed_m < limit_m - _SAME_M:
+    if config.swarm.agents > 1 and budget.committed_m < limit_m - _SAME_M:
         keeps = f"separation.radius_m = {budget.radius_m:g}: commitments keep {budget.committed_m:.2f} m"
         fails = f"the flight fails below limits.min_separation_m = {limit_m:g}"
         enough_m = math.ceil(100.0 * budget.radius_that_commits_m(limit_m) - 1e-6) / 100.0

@@ -39,6 +39,7 @@ def test_commitments_that_keep_less_than_the_flight_is_judged_by_are_named() -> 
     assert said.startswith("separation.radius_m = 0.9: commitments keep 0.82 m, and the flight fails below")
     assert said.endswith("limits.min_separation_m = 0.85; 0.95 m keeps that")
     assert lines(guaranteed, "separation.radius_m=0.95") == lines(guaranteed, "limits.min_separation_m=0.8") == []
+    assert lines(guaranteed, "swarm.agents=1") == [], "there is nobody to keep it from"
 
 
 def test_commitments_that_keep_less_from_an_obstacle_than_the_flight_is_judged_by_are_named() -> None:
