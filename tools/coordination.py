@@ -28,9 +28,9 @@ from sitl.lockstep import Lockstep
 from sitl.studies.campaign.conditions.layouts import nudged
 from swarmctl.bus.bus import agent_name
 from swarmctl.config import load
-from swarmctl.control.mpc.axes import AxesSolution
-from swarmctl.control.mpc.condensed import CondensedMpc
-from swarmctl.control.mpc.prediction import Forecast
+from swarmctl.control.mpc.condensed_qp.axes import AxesSolution
+from swarmctl.control.mpc.condensed_qp.condensed import CondensedMpc
+from swarmctl.control.mpc.condensed_qp.prediction import Forecast
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array, Phase
 

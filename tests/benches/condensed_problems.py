@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarmctl.control.mpc.axes import Axis, Horizon, Penalties
-from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.condensed_qp.axes import Axis, Horizon, Penalties
+from swarmctl.control.mpc.condensed_qp.condensed import CondensedMpc
 from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.core.types import Array
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
-from swarmctl.control.mpc import condensed, judgement
+from swarmctl.control.mpc import judgement
+from swarmctl.control.mpc.condensed_qp import condensed
 from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus
 from tests.benches.broken_solver import Spoil, break_solver, no_answer, not_numbers, wrong_answer
 from tests.faults.row import Off

@@ -27,7 +27,7 @@ from sitl.lockstep import Lockstep
 from sitl.studies.bench.slsqp import KEPT_M, NonlinearAnswer, NonlinearXy
 from swarmctl.config import Config, load
 from swarmctl.control.controllers.kind import Controller
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, AxesSolution, HalfSpaces
 from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem

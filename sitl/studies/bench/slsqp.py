@@ -20,7 +20,7 @@ import numpy as np
 from scipy import optimize
 
 from swarmctl.control.collision.keep_outs import KeepOut
-from swarmctl.control.mpc.axes import AxesProblem, Axis, Horizon
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, Axis, Horizon
 from swarmctl.core.types import Array
 
 FTOL = 1e-6  # fmincon's tolerances; of the thesis' own cost

@@ -9,7 +9,7 @@ import numpy as np
 
 from swarmctl.control.collision.keep_outs import KeepOut, KeepOuts, stacked
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.mpc.axes import HalfSpaces
+from swarmctl.control.mpc.condensed_qp.axes import HalfSpaces
 from swarmctl.core.types import Array
 
 _TINY_M = 1e-6  # nearer centres have no direction

@@ -11,7 +11,7 @@ import numpy as np
 from swarmctl.control.collision.half_spaces import half_spaces
 from swarmctl.control.collision.keep_outs import KeepOut, KeepOuts, stacked
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.mpc.axes import HalfSpaces
+from swarmctl.control.mpc.condensed_qp.axes import HalfSpaces
 from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.core.types import Array, Plan, PlanStatus

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from swarmctl.control.collision.separation import certify
 from swarmctl.control.collision.volume_certificate import volume_margin_m
-from swarmctl.control.mpc.axes import AxesSolution
+from swarmctl.control.mpc.condensed_qp.axes import AxesSolution
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes

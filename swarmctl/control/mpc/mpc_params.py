@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import ConfigDict, Field
 
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.axes import Axis, Horizon, Terminal
+from swarmctl.control.mpc.condensed_qp.axes import Axis, Horizon, Terminal
 from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params

@@ -13,13 +13,13 @@ from functools import partial
 import numpy as np
 
 from swarmctl.control.mpc.attempts import first_guess, planned_clear
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces, Penalties, faces_along
-from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, AxesSolution, HalfSpaces, Penalties, faces_along
+from swarmctl.control.mpc.condensed_qp.condensed import CondensedMpc
+from swarmctl.control.mpc.condensed_qp.sized_mpc import SizedMpc
 from swarmctl.control.mpc.controller_setup import ControllerSetup
 from swarmctl.control.mpc.judgement import judged
 from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.sized_mpc import SizedMpc
 from swarmctl.control.mpc.vertical_stop import VerticalStop
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array, Plan

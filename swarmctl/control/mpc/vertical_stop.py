@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Horizon
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, AxesSolution, Axis, Horizon
 
 
 class VerticalStop:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Horizon
-from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, AxesSolution, Axis, Horizon
+from swarmctl.control.mpc.condensed_qp.condensed import CondensedMpc
 from swarmctl.control.mpc.solvers.qp import QpParams, QpSolution
 from swarmctl.control.mpc.solvers.qp_osqp import OsqpSolver
 from swarmctl.core.types import Array

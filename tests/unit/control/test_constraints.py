@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarmctl.control.mpc.axes import AxesProblem, Axis, Faces, HalfSpaces, Horizon, Penalties, Terminal
-from swarmctl.control.mpc.constraints import (
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, Axis, Faces, HalfSpaces, Horizon, Penalties, Terminal
+from swarmctl.control.mpc.condensed_qp.constraints import (
     IncrementBounds,
     InputBounds,
     KeepOutHalfSpaces,
@@ -16,11 +16,11 @@ from swarmctl.control.mpc.constraints import (
     VolumeFaces,
     slack_m,
 )
-from swarmctl.control.mpc.prediction import Forecast, Prediction
-from swarmctl.control.mpc.program import ConstraintBlock, Program, Rows
-from swarmctl.control.mpc.session import Relaxation, SolverSession
+from swarmctl.control.mpc.condensed_qp.prediction import Forecast, Prediction
+from swarmctl.control.mpc.condensed_qp.program import ConstraintBlock, Program, Rows
+from swarmctl.control.mpc.condensed_qp.session import Relaxation, SolverSession
+from swarmctl.control.mpc.condensed_qp.tracking_cost import TrackingCost
 from swarmctl.control.mpc.solvers.qp import INFINITY, QpParams, QpSolution
-from swarmctl.control.mpc.tracking_cost import TrackingCost
 from swarmctl.core.types import Array
 
 AXIS = Axis(

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import optimize
 
-from swarmctl.control.mpc.axes import AxesProblem, HalfSpaces, Horizon
-from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, HalfSpaces, Horizon
+from swarmctl.control.mpc.condensed_qp.condensed import CondensedMpc
 from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.core.types import Array
 from tests.benches.condensed_problems import AXIS, GAIN, HORIZON, mpc, simulate

@@ -12,7 +12,7 @@ import pytest
 from swarmctl.control.collision.half_spaces import half_spaces
 from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.collision.separation import SeparationParams, certify, keep_out_of_obstacle, keep_out_of_peer
-from swarmctl.control.mpc.axes import HalfSpaces
+from swarmctl.control.mpc.condensed_qp.axes import HalfSpaces
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array
 from tests import builders

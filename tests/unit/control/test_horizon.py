@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarmctl.control.mpc.axes import Horizon
-from swarmctl.control.mpc.prediction import Prediction
+from swarmctl.control.mpc.condensed_qp.axes import Horizon
+from swarmctl.control.mpc.condensed_qp.prediction import Prediction
 from tests.benches.condensed_problems import AXIS
 
 EVERY = np.arange(1, 41)  # numbers of increments

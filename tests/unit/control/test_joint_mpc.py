@@ -13,7 +13,7 @@ import pytest
 from swarmctl.control.collision.keep_outs import KeepOut
 from swarmctl.control.collision.separation import SeparationParams, certify
 from swarmctl.control.model import acceleration
-from swarmctl.control.mpc.axes import Terminal
+from swarmctl.control.mpc.condensed_qp.axes import Terminal
 from swarmctl.control.mpc.joint_mpc import JointMpc
 from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem

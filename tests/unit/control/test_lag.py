@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from swarmctl.control.lag import Lag, lag_response
-from swarmctl.control.mpc.axes import AxesProblem, Axis, Horizon, Penalties
-from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, Axis, Horizon, Penalties
+from swarmctl.control.mpc.condensed_qp.condensed import CondensedMpc
 from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.core.types import Array
 

@@ -13,7 +13,7 @@ from swarmctl.control.collision.separation import SeparationParams, certify
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.attempts import closest_keep_outs
-from swarmctl.control.mpc.axes import AxesSolution
+from swarmctl.control.mpc.condensed_qp.axes import AxesSolution
 from swarmctl.control.mpc.judgement import RESIDUAL_LIMIT_M
 from swarmctl.control.mpc.mpc_params import MpcParams
 from swarmctl.control.mpc.problem import Problem, Start

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
-from swarmctl.control.mpc.prediction import Forecast, Prediction
-from swarmctl.control.mpc.sized_mpc import FEW, SizedMpc, rooms, within_reach
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, AxesSolution, HalfSpaces
+from swarmctl.control.mpc.condensed_qp.prediction import Forecast, Prediction
+from swarmctl.control.mpc.condensed_qp.sized_mpc import FEW, SizedMpc, rooms, within_reach
 from swarmctl.core.types import Array
 from tests.benches.condensed_problems import AXIS, GAIN, HORIZON, mpc
 

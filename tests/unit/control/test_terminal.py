@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Horizon, Penalties
-from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, AxesSolution, Axis, Horizon, Penalties
+from swarmctl.control.mpc.condensed_qp.condensed import CondensedMpc
+from swarmctl.control.mpc.condensed_qp.terminal import TerminalRegion, terminal_region, transition
 from swarmctl.control.mpc.solvers.qp import QpParams
-from swarmctl.control.mpc.terminal import TerminalRegion, terminal_region, transition
 from swarmctl.core.types import Array
 
 EXACT = QpParams(solver="daqp")

@@ -1,6 +1,6 @@
 """The constraints of a condensed MPC, each a block of rows: bounds, softened ends, half-spaces, faces of a volume.
 
-A new constraint is one class here and one line in `swarmctl.control.mpc.condensed`.
+A new constraint is one class here and one line in `swarmctl.control.mpc.condensed_qp.condensed`.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.control.mpc.axes import Faces, Penalties
-from swarmctl.control.mpc.prediction import Forecast, Prediction
-from swarmctl.control.mpc.program import ConstraintBlock, Rows
+from swarmctl.control.mpc.condensed_qp.axes import Faces, Penalties
+from swarmctl.control.mpc.condensed_qp.prediction import Forecast, Prediction
+from swarmctl.control.mpc.condensed_qp.program import ConstraintBlock, Rows
 from swarmctl.control.mpc.solvers.qp import INFINITY, QpSolution
 from swarmctl.core.types import Array
 

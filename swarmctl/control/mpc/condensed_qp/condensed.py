@@ -13,8 +13,16 @@ from functools import partial
 
 import numpy as np
 
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Faces, HalfSpaces, Horizon, Penalties
-from swarmctl.control.mpc.constraints import (
+from swarmctl.control.mpc.condensed_qp.axes import (
+    AxesProblem,
+    AxesSolution,
+    Axis,
+    Faces,
+    HalfSpaces,
+    Horizon,
+    Penalties,
+)
+from swarmctl.control.mpc.condensed_qp.constraints import (
     IncrementBounds,
     InputBounds,
     KeepOutHalfSpaces,
@@ -22,11 +30,11 @@ from swarmctl.control.mpc.constraints import (
     VolumeFaces,
     slack_m,
 )
-from swarmctl.control.mpc.prediction import Forecast, Prediction
-from swarmctl.control.mpc.program import ConstraintBlock, Program
-from swarmctl.control.mpc.session import Relaxation, SolverSession
+from swarmctl.control.mpc.condensed_qp.prediction import Forecast, Prediction
+from swarmctl.control.mpc.condensed_qp.program import ConstraintBlock, Program
+from swarmctl.control.mpc.condensed_qp.session import Relaxation, SolverSession
+from swarmctl.control.mpc.condensed_qp.tracking_cost import TrackingCost
 from swarmctl.control.mpc.solvers.qp import QpParams, QpSolution
-from swarmctl.control.mpc.tracking_cost import TrackingCost
 from swarmctl.core.types import Array
 
 _SLACK_USED_M = 1e-3

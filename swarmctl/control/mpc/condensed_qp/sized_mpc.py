@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
-from swarmctl.control.mpc.condensed import CondensedMpc
-from swarmctl.control.mpc.prediction import Forecast, Prediction
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, AxesSolution, HalfSpaces
+from swarmctl.control.mpc.condensed_qp.condensed import CondensedMpc
+from swarmctl.control.mpc.condensed_qp.prediction import Forecast, Prediction
 
 FEW = 16  # keep-outs that always have rows
 

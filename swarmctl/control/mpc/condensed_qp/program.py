@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.control.mpc.prediction import Forecast
+from swarmctl.control.mpc.condensed_qp.prediction import Forecast
 from swarmctl.control.mpc.solvers.qp import INFINITY, pattern_index
 from swarmctl.core.types import Array
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.control.mpc.axes import Axis
-from swarmctl.control.mpc.prediction import Forecast, Prediction
-from swarmctl.control.mpc.terminal import TerminalRegion, terminal_region
+from swarmctl.control.mpc.condensed_qp.axes import Axis
+from swarmctl.control.mpc.condensed_qp.prediction import Forecast, Prediction
+from swarmctl.control.mpc.condensed_qp.terminal import TerminalRegion, terminal_region
 from swarmctl.core.types import Array
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from swarmctl.control.lag import lag_response
-from swarmctl.control.mpc.axes import AxesProblem, Axis, HalfSpaces, Horizon
+from swarmctl.control.mpc.condensed_qp.axes import AxesProblem, Axis, HalfSpaces, Horizon
 from swarmctl.core.types import Array
 
 _DECIDED_S = 0.12  # motion within this time after the dead time can hardly be changed

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from swarmctl.control.mpc.program import Program
+from swarmctl.control.mpc.condensed_qp.program import Program
 from swarmctl.control.mpc.solvers.qp import QpParams, QpSolution
 from swarmctl.control.mpc.solvers.registry import make_solver
 
