@@ -32,8 +32,7 @@ class EndsElsewhere:
 
     def receive(self, report: BusReport) -> None:
         """Take in the ends that have arrived."""
-        for _ in report.ends(self._ends):
-            """It is kept."""
+        list(report.ends(self._ends))  # which are kept as they are read
 
     def down(self, now_s: float) -> tuple[int, ...]:
         """Return the agents that have ended with their vehicles down, and whom no other process speaks for."""
