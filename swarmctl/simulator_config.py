@@ -57,7 +57,9 @@ FAULTS: dict[str, FaultRule] = {
     "gps_loss": FaultRule(0, 0, 0, "no value: position drifts and its accuracy fades"),
     "estimator_jump": FaultRule(-50, 50, None, "m, of the reported position, along towards_deg"),
     "estimator_freeze": FaultRule(0, 0, 0, "no value: the estimate stays as it is"),
-    "motor": FaultRule(0, 1, 0, "0..1 of its force that a rotor keeps"),
+    "motor": FaultRule(
+        0, 1, 0, "0..1 of its force that a rotor keeps; at 0.8 an x500 holds its place, at 0.95 thesis does not"
+    ),
     "link_loss": FaultRule(0, 1, 1, "0..1 of the datagrams that are lost"),
     "link_delay": FaultRule(0, 5000, None, "ms"),
     "link_jitter": FaultRule(0, 5000, None, "ms, the most by which each datagram is late by chance"),
