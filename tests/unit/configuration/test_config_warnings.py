@@ -242,7 +242,10 @@ def test_plans_that_fall_harder_than_the_vehicle_are_named(given: tuple[str, ...
     )
 
 
-@pytest.mark.parametrize("given", [(FALLS, "controller.mpc.thrust_min_m_s2=3.92"), (FALLS, "controller.kind=pid"), ()])
+@pytest.mark.parametrize(
+    "given",
+    [(FALLS, "controller.mpc.thrust_min_m_s2=3.92"), (FALLS, "controller.kind=pid", "swarm.agents=1"), ()],
+)
 def test_negative_control_who_falls_as_planned_is_not(given: tuple[str, ...]) -> None:
     assert lines(*given) == []
 
