@@ -76,7 +76,7 @@ def _receive(bus: Bus, measured: Measured, clock: WallClock) -> None:
 
 
 def _lines() -> Iterator[bool]:
-    """Return whether a line has come on standard input, again and again until that is closed."""
+    """Yield whether a line has come on standard input since the last time, until that is closed."""
     while True:
         is_readable, _, _ = select.select([sys.stdin], [], [], 0.0)
         read = os.read(sys.stdin.fileno(), 64) if is_readable else None

@@ -314,10 +314,10 @@ def show(rows: Sequence[ScaleRow], console: Console) -> None:
     console.print("p50 (p99) of ticks and of ages; times real time on one processor", markup=False)
     for question in dict.fromkeys(row.question for row in rows):
         asked = {row.count: cells(row) for row in rows if row.question == question}
-        told = [name for place, name in enumerate(COLUMNS) if any(texts[place] for texts in asked.values())]
-        table = Table(question, *(Column(Text(name), justify="right") for name in told), box=SIMPLE)
+        told = [place for place in range(len(COLUMNS)) if any(texts[place] for texts in asked.values())]
+        table = Table(question, *(Column(Text(COLUMNS[place]), justify="right") for place in told), box=SIMPLE)
         for count, texts in asked.items():
-            table.add_row(f"{count}", *(text for text in texts if text))
+            table.add_row(f"{count}", *(texts[place] for place in told))
         console.print(table)
     for growth in growths(rows):
         console.print(growth.words, markup=False, highlight=False)
