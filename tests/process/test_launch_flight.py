@@ -116,7 +116,7 @@ def test_who_is_heard_landing_is_not_killed_on_its_way_down(
     """After Ctrl-C at a height of 90 m agents were killed before touchdown, and the flight had failed."""
     monkeypatch.setattr(swarmctl.ops.supervision.supervisor, "_LAND_S", 1.0)
     monkeypatch.setattr(swarmctl.ops.supervision.landing_order, "_LANDING_S", landing_s)
-    services = ScriptedServices(tmp_path, [FLIES_LONG if is_late else ends(EXIT_INTERRUPTED, 5.0)])
+    services = ScriptedServices(tmp_path, [IGNORES_SIGTERM if is_late else ends(EXIT_INTERRUPTED, 5.0)])
     services.phase, services.obeys = phase, False
     services.act = lambda: setattr(services, "interrupts", 1)
     problems = services.fly().problems
