@@ -19,8 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import psutil
-
+from sitl.studies.bench.bus_over_hosts import processor_s
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, RELAY, STATUS, TICK, TRAJECTORY, Topic
 from swarmctl.bus.zenoh.bus import ZenohBus
@@ -94,23 +93,18 @@ def _measured(endpoint: str, way: str, agents: int, processes: int, seconds: flo
         watcher = ZenohBus(endpoint, "run", "watcher", {TICK: [agent_name(i) for i in range(agents)]})
         time.sleep(SETTLES_S)
         pids = [router.pid, *(process.pid for process in started)]
-        before, began_s = [_spent_s(pid) for pid in pids], time.monotonic()
+        before, began_s = [processor_s(pid) for pid in pids], time.monotonic()
         while time.monotonic() < began_s + seconds:
             watcher.receive(TICK)
             time.sleep(TICK_S)
         took_s = time.monotonic() - began_s
-        of_router_s, *of_agents_s = (_spent_s(pid) - spent_s for pid, spent_s in zip(pids, before, strict=True))
+        of_router_s, *of_agents_s = (processor_s(pid) - spent_s for pid, spent_s in zip(pids, before, strict=True))
         watcher.close()
     finally:
         for process in (*started, router):
             process.kill()
             process.communicate()
     return Load(of_router_s / took_s, sum(of_agents_s) / took_s)
-
-
-def _spent_s(pid: int) -> float:
-    times = psutil.Process(pid).cpu_times()
-    return float(times.user + times.system)
 
 
 def main() -> None:

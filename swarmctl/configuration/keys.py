@@ -175,16 +175,21 @@ def _own_meanings(model: type[Params]) -> dict[str, str]:
 
     It is looked for in the file, as from Python 3.13 on `inspect` does not find the classes that pydantic makes.
     """
-    source = inspect.getsource(sys.modules[model.__module__])
-    by_line = {
-        token.start[0]: token.string.lstrip("# ").strip()
-        for token in tokenize.generate_tokens(io.StringIO(source).readline)
-        if token.type == tokenize.COMMENT
-    }
-    definitions = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef))
+    definitions, by_line = _definitions_and_comments(inspect.getsource(sys.modules[model.__module__]))
     found = {}
     for node in next(one for one in definitions if one.name == model.__name__).body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
             found[node.target.id] = " ".join(by_line[line] for line in lines if line in by_line)
     return found
+
+
+@cache
+def _definitions_and_comments(source: str) -> tuple[list[ast.ClassDef], dict[int, str]]:
+    """Return the definitions of classes in the text of a module, and its comments by line."""
+    by_line = {
+        token.start[0]: token.string.lstrip("# ").strip()
+        for token in tokenize.generate_tokens(io.StringIO(source).readline)
+        if token.type == tokenize.COMMENT
+    }
+    return [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)], by_line

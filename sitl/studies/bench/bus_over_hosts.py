@@ -75,12 +75,12 @@ def bus_cost(hosts: int, seconds: float) -> BusCost:
 def _measured(
     routers: Sequence[subprocess.Popen[str]], agents: Sequence[subprocess.Popen[str]], seconds: float
 ) -> BusCost:
-    spent_s, began_s = -sum(map(_processor_s, routers)), time.monotonic()
+    spent_s, began_s = -sum(processor_s(router.pid) for router in routers), time.monotonic()
     _tell(agents)
     time.sleep(seconds)
     _tell(agents)
     flown_s = AGENTS * (time.monotonic() - began_s)
-    spent_s += sum(map(_processor_s, routers))
+    spent_s += sum(processor_s(router.pid) for router in routers)
     heard = [Measured(**json.loads(_line(process, "the agents of a host"))) for process in agents]
     ages_ms = np.concatenate([each.path_ages_ms for each in heard])
     if not len(ages_ms):
@@ -138,6 +138,7 @@ def _tell(processes: Sequence[subprocess.Popen[str]]) -> None:
         process.stdin.flush()
 
 
-def _processor_s(process: subprocess.Popen[str]) -> float:
-    times = psutil.Process(process.pid).cpu_times()
+def processor_s(pid: int) -> float:
+    """Return the processor time that a process has used."""
+    times = psutil.Process(pid).cpu_times()
     return float(times.user + times.system)
