@@ -1,47 +1,47 @@
-"""Flies a run in one process on a simulated clock: real agents, real MAVLink bytes, faster than real time.
+"""Flies a run on a simulated clock: real agents, real MAVLink bytes, faster than real time.
 
 Nothing depends on wall time, and `swarmctl.kernels` makes results independent of the processor: a seed gives the same
-states bit for bit, in whatever order agents are ticked.
+states bit for bit, in whatever order agents are ticked, and in however many processes (`sitl.lockstep_processes`).
 """
 
 from __future__ import annotations
 
-import struct
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sitl.flight_log import FlightLog
+from sitl.flight_parts import NoParts, OtherParts, OutgoingBus, SentMessage, carry
 from sitl.world import SitlWorld
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
-from swarmctl.bus.bus import agent_name
+from swarmctl.bus.bus import Bus, Subscriptions, agent_name
 from swarmctl.bus.local.hub import LocalHub
 from swarmctl.bus.local.links import Impairments
 from swarmctl.bus.messages.json_messages import CommandMessage, EndedMessage, encode_message, first_list
 from swarmctl.bus.relay import RelayingBus
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import Config
-from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
+from swarmctl.core.clock import ClockError, OffsetClock, SimClock
 from swarmctl.core.json_safe import json_safe
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.recorded.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows
-from swarmctl.core.types import Phase, Plan
+from swarmctl.core.recorded.records import TRUTH_DTYPE
+from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
+from swarmctl.files import write_each
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.signing_keys import read_keys
 from swarmctl.telemetry.evaluation.referee import RunData
-from swarmctl.telemetry.recording.file_names import events_file, frames_file, plans_file, received_file, ticks_file
+from swarmctl.telemetry.recording.file_names import ticks_file
 
 _TAIL_S = 120.0  # time allowed before and after the mission, and beyond what ends by itself
 _SINKS_M_S = 0.1  # of vehicles that land, at least: another one rests, or is flown by a pilot
@@ -51,64 +51,24 @@ _OBSTACLES_EVERY_US = 1_000_000
 _WHOLE = 1e-6  # by which a number of steps may differ from a whole one
 
 
-@dataclass(kw_only=True)
-class FlightLog:
-    """Records of one agent, in memory and, if there is one, in a run folder."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flown:
+    """Holds what a flight, or a part of one, has recorded, after its agents' files were written."""
 
-    directory: Path | None
-    agent: int
-    clock: Clock  # the agent's own
-    rows: list[NDArray[np.void]] = field(default_factory=list)
-    plans: list[bytes] = field(default_factory=list)  # predicted paths, only for a run folder
-    received_rows: list[bytes] = field(default_factory=list)  # likewise
-    events: list[dict[str, Any]] = field(default_factory=list)
-    _tlog: BinaryIO | None = None
+    ticks: dict[int, NDArray[np.void]]  # agent -> (T,) of `TICK_DTYPE`
+    truth: NDArray[np.void]  # (T * N,) of `TRUTH_DTYPE`
+    events: list[dict[str, Any]]  # of the agents
+    fault_events: list[dict[str, Any]]
+    problems: list[str]  # why the mission is not complete; none: it is
+    unwritten: tuple[str, ...]  # files that the disk did not take, and why
 
-    def __post_init__(self) -> None:
-        if self.directory is not None:
-            self._tlog = (self.directory / frames_file(self.agent)).open("wb")
-
-    def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
-        self.rows.append(row)
-        if self.directory is not None:
-            self.plans.append(plan_rows(row, flown).tobytes())
-
-    def received(self, rows: bytes) -> None:
-        if self.directory is not None:
-            self.received_rows.append(rows)
-
-    def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
-        source = agent_name(self.agent)
-        self.events.append({"utc_us": utc_us, "t_us": t_us, "source": source, "event": name, **fields})
-
-    def frame(self, frame: bytes) -> None:
-        if self._tlog is not None:
-            with suppress(OSError):  # a full disk loses frames, never the flight
-                self._tlog.write(struct.pack(">Q", self.clock.utc_us()) + frame)
-
-    @property
-    def ticks(self) -> NDArray[np.void]:
-        """All ticks, (T,) of `TICK_DTYPE`."""
-        return np.concatenate(self.rows) if self.rows else np.zeros(0, TICK_DTYPE)
-
-    def close(self) -> None:
-        """Write the files that a live agent writes.
-
-        Raises:
-            OSError: the disk refuses.
-        """
-        if self.directory is None or self._tlog is None:
-            return
-        with suppress(OSError):
-            self._tlog.close()
-        (self.directory / ticks_file(self.agent)).write_bytes(self.ticks.tobytes())
-        (self.directory / plans_file(self.agent)).write_bytes(b"".join(self.plans))
-        (self.directory / received_file(self.agent)).write_bytes(b"".join(self.received_rows))
-        write_events(self.directory / events_file(agent_name(self.agent)), self.events)
+    def run_data(self) -> RunData:
+        """Return what a run folder holds of it."""
+        return RunData(self.ticks, self.truth, [json_safe(event) for event in self.events + self.fault_events])
 
 
 class Lockstep:
-    """Steps the world and all agents of one flight, tick by tick.
+    """Steps the world and all agents of one flight, or of a part of it, tick by tick.
 
     Args:
         config: the run.
@@ -119,6 +79,13 @@ class Lockstep:
             own; the operator, the simulator and everything on monotonic time are right.
         rehearses: agents plan on the ground as in the air, as they do in real time. It takes a tenth of a flight's
             computation and changes nothing, except for agents that the caller makes as slow as their plans would be.
+        part: numbers of the agents that are stepped here, with their vehicles; none: all. The part with the first
+            one has the operator.
+        others: steps the other parts.
+
+    Attributes:
+        agents: those stepped here, in order; None for one that has died.
+        logs: their records.
     """
 
     def __init__(
@@ -130,44 +97,70 @@ class Lockstep:
         clocks: Mapping[int, ClockError] | None = None,
         *,
         rehearses: bool = False,
+        part: range = range(0),
+        others: OtherParts | None = None,
     ) -> None:
-        if reason := why_not_repeatable():
+        everyone = range(config.swarm.agents)
+        self._part = part or everyone
+        if self._has_operator and (reason := why_not_repeatable()):  # once for all parts
             warnings.warn(f"this flight may differ from the same one elsewhere: {reason}", stacklevel=2)
-        agents = config.swarm.agents
+        self._others: OtherParts = others or NoParts()
         self.config = config
         self.clock = SimClock()
         self._physics_us = round(1e6 / config.sitl.physics_hz)
         self._tick_us = self._physics_us * _steps_per_tick(config)
         latency_us = round(config.sitl.link_latency_ms * 1000)
-        self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]  # (agent's, vehicle's) ends
-        self._keys = read_keys(config.mavlink.signing_keys, agents)
-        self.world = SitlWorld(config.simulator(), [vehicle for _, vehicle in self.links], keys=self._keys)
+        self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in everyone]  # (agent's, vehicle's) ends
+        self._keys = read_keys(config.mavlink.signing_keys, len(everyone))
+        vehicles = [vehicle for _, vehicle in self.links]
+        self.world = SitlWorld(config.simulator(), vehicles, keys=self._keys, stepped=self._part)
         self.hub = _hub(config, self.clock)
         errors = clocks or {}
-        own_clocks = [OffsetClock(self.clock, errors[i]) if i in errors else self.clock for i in range(agents)]
-        self.logs = [FlightLog(directory=directory, agent=i, clock=own_clocks[i]) for i in range(agents)]
+        own_clocks = [OffsetClock(self.clock, errors[i]) if i in errors else self.clock for i in self._part]
+        named = zip(self._part, own_clocks, strict=True)
+        self.logs = [FlightLog(directory=directory, agent=i, clock=clock) for i, clock in named]
         self.fault_events: list[dict[str, Any]] = []
         self.world.faults.on_event = self._on_fault
-        self._operator = self.hub.connect(topics.OPERATOR, {})
+        self._sent: list[SentMessage] = []  # in this step, for the others
+        self._operator = self._outgoing(topics.OPERATOR, {})
         self._own, self._rehearses = dict(own or {}), rehearses
-        self._starts = [0] * agents  # of further processes
-        self.agents: list[Agent | None] = [self._agent(i) for i in range(agents)]
+        self._starts = dict.fromkeys(self._part, 0)  # of further processes
+        self.agents: list[Agent | None] = self._attach_agents()
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
         self.starved: dict[int, int] = {}  # agent -> its processor executes one tick out of this many
-        self._missed = [0] * agents
+        self._missed = dict.fromkeys(self._part, 0)
         self._steps = 0
-        self._order = list(order) if order is not None else list(range(agents))
+        self._order = list(order) if order is not None else list(self._part)
         self._truth: list[NDArray[np.void]] = []
         self._obstacles = first_list(config.obstacles, self.clock.utc_us())
+
+    def _attach_agents(self) -> list[Agent | None]:
+        """Attach all agents to the bus, in every part in the same order; return those of this part."""
+        agents: list[Agent | None] = []
+        for i in range(self.config.swarm.agents):
+            if i in self._part:
+                agents.append(self._agent(i))
+            else:
+                self.hub.connect(agent_name(i), {})
+        return agents
+
+    def _outgoing(self, name: str, subscriptions: Subscriptions) -> Bus:
+        """Return the bus of a participant that the other parts hear, too."""
+        bus = self.hub.connect(name, subscriptions)
+        return bus if isinstance(self._others, NoParts) else OutgoingBus(bus, name, self._sent)
+
+    @property
+    def _has_operator(self) -> bool:
+        return self._part.start == 0
 
     def _on_fault(self, name: str, t_us: int, fields: dict[str, Any]) -> None:
         stamp = {"utc_us": self.clock.utc_us(), "t_us": self.clock.now_us(), "source": "sitl", "event": name}
         self.fault_events.append({**stamp, "since_boot_us": t_us, **fields})
 
     def _agent(self, index: int) -> Agent:
-        log = self.logs[index]
+        log = self.logs[self._part.index(index)]
         others = [i for i in range(self.config.swarm.agents) if i != index]
-        bus = RelayingBus(self.hub.connect(agent_name(index), dict.fromkeys(topics.FOR_AGENTS)), others)
+        bus = RelayingBus(self._outgoing(agent_name(index), dict.fromkeys(topics.FOR_AGENTS)), others)
         config = self._own.get(index, self.config)
         key = self._keys[index]
         return make_agent(
@@ -189,11 +182,13 @@ class Lockstep:
 
     def step(self) -> None:
         """Tick every agent once, then step the physics to the next tick."""
+        self._others.begin_step()
         now_us = self.clock.now_us()
-        if _is_due(now_us, self._tick_us, _OBSTACLES_EVERY_US):
+        if self._has_operator and _is_due(now_us, self._tick_us, _OBSTACLES_EVERY_US):
             self._operator.publish(topics.OBSTACLES, encode_message(self._obstacles))
+        first = self._part.start
         for i in self._order:
-            agent = self.agents[i]
+            agent = self.agents[i - first]
             if agent is None or i in self.frozen:
                 continue
             if self._steps % self.starved.get(i, 1):
@@ -201,15 +196,17 @@ class Lockstep:
                 continue
             agent.tick(now_us, self._missed[i])
         self._steps += 1
+        carry(self.hub, self._others.exchange(self._sent, self._have_finished()))
+        self._sent.clear()
         for _ in range(self._tick_us // self._physics_us):
             self.clock.advance(self._physics_us)
             self.world.step(self.clock.now_us())
             if _is_due(self.clock.now_us(), self._physics_us, _TRUTH_EVERY_US):
-                self._truth.append(self.world.truth_rows())
+                self._truth.append(self.world.truth_rows()[self._part.start : self._part.stop])
 
     def kill(self, index: int) -> None:
         """End an agent's process: no more setpoints, its bus session closes, and the others are told as by a launch."""
-        self.agents[index] = None
+        self.agents[self._part.index(index)] = None
         self.hub.detach(agent_name(index))
         ended = EndedMessage(agent=index, boot_id=self._boot_id(index), is_down=False)
         self._operator.publish(topics.ENDED, encode_message(ended))
@@ -224,7 +221,7 @@ class Lockstep:
     def start_again(self, index: int) -> None:
         """Start another process for an agent that was killed: it finds its vehicle where it is."""
         self._starts[index] += 1
-        self.agents[index] = self._agent(index)
+        self.agents[self._part.index(index)] = self._agent(index)
 
     def command(self, verb: str, agent: int = -1, **arguments: float) -> None:
         """Send an operator's order, as a verb does."""
@@ -238,6 +235,10 @@ class Lockstep:
 
     @property
     def finished(self) -> bool:
+        """Whether every agent has finished, or died."""
+        return self._have_finished() and self._others.finished
+
+    def _have_finished(self) -> bool:
         return all(agent is None or agent.finished for agent in self.agents)
 
     def mission_is_over(self) -> bool:
@@ -246,18 +247,35 @@ class Lockstep:
 
     @property
     def truth(self) -> NDArray[np.void]:
-        """True states so far, (T * N,) of `TRUTH_DTYPE`."""
+        """True states of the vehicles stepped here, so far, (T * N,) of `TRUTH_DTYPE`."""
         return np.concatenate(self._truth) if self._truth else np.zeros(0, TRUTH_DTYPE)
 
     def recorded(self) -> RunData:
         """Return what a run folder would hold of the flight so far."""
-        events = [event for log in self.logs for event in log.events] + self.fault_events
-        return RunData({log.agent: log.ticks for log in self.logs}, self.truth, [json_safe(event) for event in events])
+        return self._flown(()).run_data()
+
+    def end(self) -> Flown:
+        """Note the totals of every agent, write their files if there is a folder, and return what was flown."""
+        for log, agent in zip(self.logs, self.agents, strict=True):
+            if agent is not None:
+                for name, fields in agent.totals(lost=0).items():
+                    log.event(name, log.clock.now_us(), log.clock.utc_us(), **fields)
+        return self._flown(write_each({ticks_file(log.agent): log.close for log in self.logs}))
+
+    def _flown(self, unwritten: tuple[str, ...]) -> Flown:
+        return Flown(
+            ticks={log.agent: log.ticks for log in self.logs},
+            truth=self.truth,
+            events=[event for log in self.logs for event in log.events],
+            fault_events=self.fault_events,
+            problems=self.problems(),
+            unwritten=unwritten,
+        )
 
     def problems(self) -> list[str]:
         """Return why the mission is not complete; empty when it is."""
         found = []
-        for i, agent in enumerate(self.agents):
+        for i, agent in zip(self._part, self.agents, strict=True):
             if agent is None:
                 found.append(f"agent {i} died")
             elif not agent.finished or agent.outcome != "completed":
@@ -269,7 +287,7 @@ class Lockstep:
         limit_us = round((self.config.mission.duration_s + _TAIL_S) * 1e6)
         while not self.finished:
             if self.clock.now_us() >= limit_us:
-                left_s = self._ends_in_s()
+                left_s = max(self.ends_in_s(), self._others.ends_in_s())
                 if not left_s:
                     return
                 limit_us = self.clock.now_us() + round((left_s + _TAIL_S) * 1e6)
@@ -277,15 +295,20 @@ class Lockstep:
             if on_step is not None and on_step(self):
                 return
 
-    def _ends_in_s(self) -> float:
-        """Return until when agents do what ends by itself, such as a long way back or down; 0 where nobody does."""
+    def ends_in_s(self) -> float:
+        """Return for how long agents of this part do what ends by itself, such as a long way back or down.
+
+        It is 0 where nobody does.
+        """
         left_s = [agent.ends_in_s for agent in self.agents if agent is not None]
-        left_s += [self._lands_in_s(i) for i, agent in enumerate(self.agents) if agent is not None]
+        left_s += [
+            self._lands_in_s(log) for log, agent in zip(self.logs, self.agents, strict=True) if agent is not None
+        ]
         return max((seconds for seconds in left_s if seconds > 0.0), default=0.0)
 
-    def _lands_in_s(self, index: int) -> float:
+    def _lands_in_s(self, log: FlightLog) -> float:
         """Return how long a vehicle that its autopilot lands may still sink; 0 where it does not."""
-        rows, truth = self.logs[index].rows, self.world.truth_rows()[index]
+        rows, truth = log.rows, self.world.truth_rows()[log.agent]
         lands = bool(rows) and rows[-1]["phase"][0] == Phase.LAND and truth["vel_ned_m_s"][2] > _SINKS_M_S
         height_m = self.config.sitl.ground_z_m - float(truth["pos_ned_m"][2])
         return height_m / _LANDS_M_S if lands and self.config.sitl.start == "ground" else 0.0
@@ -320,8 +343,3 @@ def _hub(config: Config, clock: SimClock) -> LocalHub:
         jitter_us=round(bus.jitter_ms * 1000),
     )
     return LocalHub(clock.now_us, config.seed, impairments, lease_us=1000 * bus.lease_ms)
-
-
-def write_events(path: Path, events: Sequence[dict[str, Any]]) -> None:
-    """Write one JSON object per line, as live processes log them."""
-    path.write_bytes(b"".join(msgspec.json.encode(event) + b"\n" for event in events))

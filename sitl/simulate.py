@@ -1,6 +1,7 @@
 """The `simulate` verb: a lockstep flight with the run folder, summary and exit code of a launch.
 
-`python -m sitl.simulate [CONFIG] [--agents N] [--duration S] [--run-dir DIR] [--seed K] [--set key=value] [--view]`
+`python -m sitl.simulate [CONFIG] [--agents N] [--duration S] [--run-dir DIR] [--seed K] [--set key=value] [--jobs N]
+[--view]`
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from typing import Any
 
 from rich.progress import Progress
 
-from sitl.lockstep import Lockstep, write_events
+from sitl.arguments import count
+from sitl.flight_log import write_events
+from sitl.lockstep import Flown
+from sitl.lockstep_processes import LockstepProcesses
 from swarmctl.config import Config, dump, load
 from swarmctl.configuration.config_warnings import warning_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, SwarmError, exit_code_of
@@ -25,7 +29,8 @@ from swarmctl.files import replace_bytes, write_each
 from swarmctl.ops.flight.summary import draw_recording, summary_lines, unwritten_line, violation_lines
 from swarmctl.ops.supervision.status_table import PlainLines
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.telemetry.recording.file_names import RECORDING, TRUTH, events_file, ticks_file
+from swarmctl.process_priority import usable_processors
+from swarmctl.telemetry.recording.file_names import RECORDING, TRUTH, events_file
 from swarmctl.telemetry.recording.kept_outcome import forget_outcome
 from swarmctl.telemetry.recording.new_run_folder import create_run_folder, held_run, write_config
 from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
@@ -33,44 +38,41 @@ from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording
 from swarmctl.wall_clock import utc_us
 
 
-def simulate(config: Config, directory: Path) -> int:
-    """Fly `config` in lockstep into the run folder `directory` and return the exit code."""
+def simulate(config: Config, directory: Path, jobs: int) -> int:
+    """Fly `config` in lockstep, in `jobs` processes, into the run folder `directory` and return the exit code."""
     with held_run(directory):
         write_config(directory, dump(config), "lockstep")
-        return _simulate(config, directory)
+        with LockstepProcesses(config, directory, jobs) as flight:
+            return _simulate(config, directory, flight)
 
 
-def _simulate(config: Config, directory: Path) -> int:
-    flight = Lockstep(config, directory)
+def _simulate(config: Config, directory: Path, flight: LockstepProcesses) -> int:
     stop = StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP, raise_at=2)  # the first request lands
     began_s = time.perf_counter()
     is_landing = False
     with _progress(config) as advance:
 
-        def on_step(lockstep: Lockstep) -> None:
+        def on_step() -> None:
             nonlocal is_landing
             if stop.count and not is_landing:
                 is_landing = True
-                lockstep.command("land")
-            advance(lockstep.clock.now_us() * 1e-6)
+                flight.command("land")
+            advance(flight.clock.now_us() * 1e-6)
 
         flight.run(on_step)
     wall_s = time.perf_counter() - began_s
     interrupted = bool(stop.count)  # what is asked from here on is too late: it has landed
-    problems = flight.problems()
+    flown = flight.end()
+    problems = flown.problems
     outcome = "interrupted" if interrupted else "failed" if problems else "completed"
-    for log, agent in zip(flight.logs, flight.agents, strict=True):
-        if agent is not None:
-            for name, fields in agent.totals(lost=0).items():
-                log.event(name, log.clock.now_us(), log.clock.utc_us(), **fields)
     speed_factor = flight.clock.now_us() * 1e-6 / wall_s
     shown = () if interrupted else tuple(problems)
-    gone = _write_rows(flight, directory)
+    gone = (*flown.unwritten, *_write_world(flown, directory))
     finished = finish_run(
         directory,
         config.rules("lockstep"),
         Outcome(outcome=outcome, problems=shown, speed_factor=speed_factor),
-        flight.recorded(),
+        flown.run_data(),
     )
     summary, unwritten = finished.summary, (*gone, *finished.unwritten)
     if gone:
@@ -104,15 +106,12 @@ def _progress(config: Config) -> Iterator[Callable[[float], None]]:
             bar.stop()
 
 
-def _write_rows(flight: Lockstep, directory: Path) -> tuple[str, ...]:
-    """Write the files that live processes write; return what the disk did not take."""
-    writers: dict[str, Callable[[], object]] = {
-        TRUTH: lambda: replace_bytes(directory / TRUTH, flight.truth.tobytes()),
-        **{ticks_file(log.agent): log.close for log in flight.logs},
-    }
-    if flight.fault_events:
+def _write_world(flown: Flown, directory: Path) -> tuple[str, ...]:
+    """Write the files that a live simulator writes; return what the disk did not take."""
+    writers: dict[str, Callable[[], object]] = {TRUTH: lambda: replace_bytes(directory / TRUTH, flown.truth.tobytes())}
+    if flown.fault_events:
         faults = events_file("sitl")
-        writers[faults] = lambda: write_events(directory / faults, flight.fault_events)
+        writers[faults] = lambda: write_events(directory / faults, flown.fault_events)
     return write_each(writers)
 
 
@@ -124,6 +123,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", metavar="K", dest="seed")
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], dest="sets")
     parser.add_argument("--run-dir", metavar="DIR", type=Path, dest="run_dir")
+    processors = len(usable_processors())
+    jobs = "processes that share the agents, which changes no result; default: %(default)s, one per processor"
+    parser.add_argument("--jobs", metavar="N", type=count, default=processors, help=jobs)
     parser.add_argument("--view", action=argparse.BooleanOptionalAction, default=False)
     return parser
 
@@ -141,7 +143,7 @@ def _run(options: dict[str, Any]) -> int:
     for line in warning_lines(config):
         print(line, file=sys.stderr)
     directory = create_run_folder(options["run_dir"], config.name, utc_us())
-    code = simulate(config, directory)
+    code = simulate(config, directory, options["jobs"])
     if options["view"]:
         _open(directory / RECORDING)
     return code

@@ -47,7 +47,9 @@ class SitlWorld:
     """The simulation. `transports` are the vehicle ends of the links, in vehicle order.
 
     `gcs_transports` are those of a second link per vehicle, to a ground station, as in PX4. `keys` are those of
-    vehicles that sign from the start; empty: none does, until it is set up.
+    vehicles that sign from the start; empty: none does, until it is set up. `stepped` are the vehicles whose autopilots
+    are stepped here; empty: all. The others stand idle, and keep the numerics of the plant what they are with all:
+    products of matrices round by the number of columns.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class SitlWorld:
         transports: Sequence[Transport],
         gcs_transports: Sequence[Transport] = (),
         keys: Sequence[SigningKey | None] = (),
+        stepped: range = range(0),
     ) -> None:
         if len(transports) != params.vehicles or len(gcs_transports) not in (0, params.vehicles):
             raise ValueError(f"transports: {len(transports)} and {len(gcs_transports)} for {params.vehicles} vehicles")
@@ -80,7 +83,9 @@ class SitlWorld:
             self.autopilots.append(pilot)
             self.endpoints.append(interfaces[0])
             self.gcs_endpoints.extend(interfaces[1:])
+        self._stepped = stepped or range(count)
         self._metered = [pilot if isinstance(pilot, Metered) else None for pilot in self.autopilots]
+        self._speaking = [self.endpoints[i] for i in self._stepped]
         self._wrench = np.zeros((4, count))
         self._powered = np.zeros(count, dtype=bool)
         self._kept = np.zeros(count, dtype=bool)  # on the ground or clamped
@@ -133,7 +138,8 @@ class SitlWorld:
         self.receive(now_us)
         if self._steps % self._autopilot_every == 0:
             self.imu.sample()
-            for i, pilot in enumerate(self.autopilots):
+            for i in self._stepped:
+                pilot = self.autopilots[i]
                 estimate = self.estimator.of(i, since_boot_us)
                 metered = self._metered[i]
                 if metered is not None and estimate.battery is not FULL:
@@ -143,7 +149,7 @@ class SitlWorld:
         self._take_outputs()
         self.physics.step(since_boot_us * 1e-6, self._wrench, self._live())
         self._now_us = now_us
-        for endpoint in self.endpoints:
+        for endpoint in self._speaking:
             endpoint.send_due(since_boot_us)
         for endpoint in self.gcs_endpoints:
             endpoint.send_due(since_boot_us)
@@ -151,7 +157,7 @@ class SitlWorld:
     def receive(self, now_us: int) -> None:
         """Handle everything that has arrived, without a step."""
         since_boot_us = now_us - (now_us if self._boot_us is None else self._boot_us)
-        for endpoint in self.endpoints:
+        for endpoint in self._speaking:
             endpoint.receive(since_boot_us, now_us)
         for endpoint in self.gcs_endpoints:
             endpoint.receive(since_boot_us, now_us)
@@ -208,8 +214,8 @@ class SitlWorld:
     def _take_outputs(self) -> None:
         """Pass changed setpoints to the attitude loops, and open clamps."""
         thrust_max_n = self.plant.preset.thrust_max_n
-        for i, pilot in enumerate(self.autopilots):
-            output = pilot.output
+        for i in self._stepped:
+            output = self.autopilots[i].output
             if output is not self._flown[i]:
                 self._flown[i] = output
                 self.attitude.set_reference(i, output.q_nb)

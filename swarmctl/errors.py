@@ -35,6 +35,10 @@ class ConfigError(SwarmError):
         self.problems = tuple(problems)
         super().__init__("\n".join(printable(f"{source}: {problem}", _MAX_CHARACTERS) for problem in self.problems))
 
+    def __reduce__(self) -> tuple[type[ConfigError], tuple[str, tuple[str, ...]]]:
+        """Let another process raise it."""
+        return type(self), (self.source, self.problems)
+
 
 class StartError(SwarmError):
     """A required process, port, vehicle or link did not come up."""

@@ -56,6 +56,11 @@ def is_realtime_permitted() -> bool:
     return granted == [True]
 
 
+def usable_processors() -> tuple[int, ...]:
+    """Return the numbers of the processors that this process may use, the least one first."""
+    return tuple(sorted(os.sched_getaffinity(0))) if sys.platform == "linux" else tuple(range(os.cpu_count() or 1))
+
+
 def bind_to_processor(pid: int, processor: int) -> None:
     """Let a process that has just been started run on one processor alone, with all threads that it will start.
 

@@ -37,19 +37,21 @@ _MAX_NOTE_BYTES = 65_536
 Agents = int | Iterable[int] | None
 
 
-def simulate(config: Config | None = None, folder: str | Path | None = None) -> Run:
+def simulate(config: Config | None = None, folder: str | Path | None = None, *, jobs: int | None = None) -> Run:
     """Fly in lockstep, faster than real time, and return the recorded run. The same seed gives the same run.
 
     Args:
         config: what to fly; None for the defaults.
         folder: run folder to create; None for `runs/<UTC>-<name>`.
+        jobs: processes that share the agents, which changes no result; None for one per processor.
 
     Raises:
         ConfigError, StartError: nothing was flown. A failed mission is no error: see `Run.outcome`.
     """
     flown = config or Config()
     directory = _new_folder(flown, folder)
-    process = FlightProcess("simulate", directory, "sitl.simulate", str(directory / CONFIG), f"--run-dir={directory}")
+    arguments = [str(directory / CONFIG), f"--run-dir={directory}", *([] if jobs is None else [f"--jobs={jobs}"])]
+    process = FlightProcess("simulate", directory, "sitl.simulate", *arguments)
     process.wait()
     process.refuse_no_flight()
     return load_run(directory)

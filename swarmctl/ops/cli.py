@@ -146,10 +146,24 @@ def simulate(
     seed: Seed = None,
     sets: Set = None,
     view: View = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs",
+            metavar="N",
+            help="Processes that share the agents, the result is the same; default: all processors.",
+        ),
+    ] = None,
 ) -> NoReturn:
-    """Fly the same agents in one process on a simulated clock. Deterministic, faster than real time."""
+    """Fly the same agents on a simulated clock. Deterministic, faster than real time."""
     arguments = [] if config is None else [str(config)]
-    for name, value in (("--agents", agents), ("--duration", duration), ("--run-dir", run_dir), ("--seed", seed)):
+    for name, value in (
+        ("--agents", agents),
+        ("--duration", duration),
+        ("--run-dir", run_dir),
+        ("--seed", seed),
+        ("--jobs", jobs),
+    ):
         arguments += [] if value is None else [f"{name}={value}"]
     arguments += [f"--set={item}" for item in sets or ()]
     arguments += [] if view is None else ["--view" if view else "--no-view"]

@@ -31,7 +31,7 @@ from swarmctl.configuration.view import viewed_flight
 from swarmctl.core.text import printable
 from swarmctl.errors import StartError
 from swarmctl.process_lifetime import PARENT_ENV, module_command
-from swarmctl.process_priority import bind_to_processor
+from swarmctl.process_priority import bind_to_processor, usable_processors
 from swarmctl.telemetry.recording.file_names import CONFIG, TRUTH, events_file
 
 ROUTER = "router"
@@ -85,14 +85,9 @@ def wants_realtime(config: Config, agents: Sequence[int]) -> bool:
     """
     if sys.platform != "linux":
         return False
-    processes, processors = len(_shares(len(agents), config.swarm.agents_per_process)), len(_usable_processors())
+    processes, processors = len(_shares(len(agents), config.swarm.agents_per_process)), len(usable_processors())
     is_little = len(agents) <= _AGENTS_PER_PROCESSOR * processors or processes <= processors
     return config.agent.realtime and is_little
-
-
-def _usable_processors() -> tuple[int, ...]:
-    """Return the numbers of the processors that this process may use, the least one first."""
-    return tuple(sorted(os.sched_getaffinity(0))) if sys.platform == "linux" else tuple(range(os.cpu_count() or 1))
 
 
 def router_command(context: RunContext, links: RouterLinks | None) -> Command:
@@ -120,7 +115,7 @@ def agent_commands(
         config_path: resolved configuration, when it is not in the run folder.
     """
     commands = []
-    last_first = itertools.cycle(reversed(_usable_processors()))  # interrupts are often served by the first ones
+    last_first = itertools.cycle(reversed(usable_processors()))  # interrupts are often served by the first ones
     for places in _shares(len(context.agents), config.swarm.agents_per_process):
         argv = module_command("swarmctl", "agent", "--config", f"{config_path or context.directory / CONFIG}")
         argv += ("--run", context.run, "--bus", context.endpoint, "--run-dir", f"{context.directory}")
@@ -144,7 +139,7 @@ def _shares(agents: int, most: int) -> list[range]:
 
 def crowding_warning(config: Config, agents: Sequence[int]) -> list[str]:
     """Return what to say where processes of agents have too few processors."""
-    processors = len(_usable_processors())
+    processors = len(usable_processors())
     processes = len(_shares(len(agents), config.swarm.agents_per_process))
     lines = []
     if config.agent.pinned and processes >= processors:

@@ -55,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Lockstep, "step", ordering)
-        simulate(load(None, CROSSING), directory)
+        simulate(load(None, CROSSING), directory, 1)
     assert not due
     return directory
 
@@ -87,7 +87,7 @@ def test_messages_that_come_late_are_known_in_the_tick_that_took_them(tmp_path: 
     Peers' statuses come late too, and the rate shows whether it is told that a peer keeps up.
     """
     late = ("bus.delay_ms=30", "bus.jitter_ms=80", "bus.loss_01=0.05", "agent.rate_hz=10")
-    simulate(load(None, [*CROSSING, *late]), tmp_path)
+    simulate(load(None, [*CROSSING, *late]), tmp_path, 1)
     for agent in decisions_of_run(tmp_path, ()):
         assert agent.compared > 200
         assert agent.phases_differ == agent.plans_differ == 0

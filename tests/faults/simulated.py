@@ -13,7 +13,8 @@ from unittest.mock import patch
 import numpy as np
 
 import swarmctl
-from sitl.lockstep import Lockstep, write_events
+from sitl.flight_log import write_events
+from sitl.lockstep import Lockstep
 from swarmctl.agent.agent import Agent
 from swarmctl.config import Config, dump, load
 from swarmctl.core.clock import ClockError

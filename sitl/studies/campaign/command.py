@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -23,7 +22,7 @@ from typing import Any, TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from sitl.studies.arguments import count, seed
+from sitl.arguments import count, seed
 from sitl.studies.campaign.conditions.disturbances import DISTURBANCES, NONE
 from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS
 from sitl.studies.campaign.conditions.scenarios import AIRFRAMES, SCENARIOS
@@ -37,6 +36,7 @@ from sitl.studies.campaign.summary import summaries
 from sitl.studies.campaign.trials import Cell, Row, Trial, cells, trial_of, unflown
 from sitl.studies.campaign.worker_pool import fly_trial, on_cluster, on_this_machine
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, exit_code_of
+from swarmctl.process_priority import usable_processors
 
 MAX_AGENTS = 100
 _AXES = (  # options that --quick has its own values of
@@ -186,7 +186,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--trials", metavar="N", type=count, default=20, help="seeds of every cell, default %(default)s")
     add("--first-seed", metavar="K", type=seed, default=1)
     add("--out", metavar="DIR", type=Path, default=Path("runs/campaign"), help="default %(default)s")
-    add("--jobs", metavar="N", type=count, default=os.cpu_count() or 1, help="processes, default %(default)s")
+    add("--jobs", metavar="N", type=count, default=len(usable_processors()), help="processes, default %(default)s")
     add("--dask", metavar="HOST:PORT", help="fly on the workers of this scheduler instead")
     add("--mix", action="store_true", help="go on in a folder whose rows were flown by other sources")
     add("--quick", action="store_true", help="the subset that is tested with every change; leaves the axes above out")

@@ -7,13 +7,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from functools import partial
 from pathlib import Path
 
-from sitl.studies.arguments import count, seed
+from sitl.arguments import count, seed
 from swarmctl.errors import exit_code_of
+from swarmctl.process_priority import usable_processors
 
 _WHAT = """Fly every combination of values in lockstep, faster than real time, on all processors. The same call again
 goes on where it stopped. Rows go to OUT/rows.parquet as they come in; OUT/report.html has the table and charts."""
@@ -45,7 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--duration", metavar="S", help="duration of every mission [s]; default: that of the configuration")
     add("--seeds", metavar="N", type=count, default=1, help="seeds of every combination; default %(default)s")
     add("--seed", metavar="K", type=seed, help="the first of them; default: that of the configuration")
-    add("--jobs", metavar="N", type=count, default=os.cpu_count() or 1, help="processes; default %(default)s")
+    add("--jobs", metavar="N", type=count, default=len(usable_processors()), help="processes; default %(default)s")
     add("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="folder; default %(default)s")
     return parser
 

@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from functools import partial
 from pathlib import Path
 
 from swarmctl.errors import exit_code_of
+from swarmctl.process_priority import usable_processors
 
 _WHAT = (
     "The `reproduce` verb: flies the six experiments of the thesis and writes the results beside the published ones."
@@ -34,7 +34,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--plant", action="store_true", help="fly the model only, as the thesis did")
     add("--full", action="store_true", help="fly the full MAVLink loop only")
     add("--out", type=Path, metavar="DIR", help="folder to write; default runs/<UTC>-reproduce")
-    processes = min(8, len(os.sched_getaffinity(0)))
+    processes = min(8, len(usable_processors()))
     add("--jobs", type=int, metavar="N", default=processes, help="processes; default: one per processor, at most 8")
     return parser
 

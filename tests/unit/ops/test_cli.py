@@ -399,10 +399,29 @@ def test_options_override_sets_and_simulate_passes_everything_on(run: Run, monke
     ]
     passed: list[tuple[str, list[str]]] = []
     monkeypatch.setattr(os, "execv", lambda program, arguments: passed.append((program, arguments)))
-    assert run("simulate", "a.toml", "--agents", "4", "--seed", "6", "--set", "a=b", "--set", "c=d", "--no-view") == 0
+    assert (
+        run(
+            "simulate",
+            "a.toml",
+            "--agents",
+            "4",
+            "--seed",
+            "6",
+            "--set",
+            "a=b",
+            "--set",
+            "c=d",
+            "--jobs=2",
+            "--no-view",
+        )
+        == 0
+    )
     module = [sys.executable, "-m", "sitl.verb", "sitl.simulate"]
     assert passed == [
-        (sys.executable, [*module, "a.toml", "--agents=4", "--seed=6", "--set=a=b", "--set=c=d", "--no-view"])
+        (
+            sys.executable,
+            [*module, "a.toml", "--agents=4", "--seed=6", "--jobs=2", "--set=a=b", "--set=c=d", "--no-view"],
+        )
     ]
 
 

@@ -25,17 +25,16 @@ SHORT = ("--agents", "1", "--duration", "2", "--set", "telemetry.enabled=false",
 def test_a_full_disk_costs_the_files_and_not_the_verdict(tmp_path: Path) -> None:
     code = "import resource, sys; from sitl.simulate import main\n"
     code += "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\nsys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, *SHORT, "--run-dir", str(tmp_path / "run")]
+    command = [sys.executable, "-c", code, *SHORT, "--agents", "2", "--jobs", "2", "--run-dir", str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     lines = done.stdout.splitlines()
     assert done.returncode == 4, done.stderr
     assert lines[0].startswith("completed, summed mean tracking error")
-    assert lines[1].startswith("no other agent")
-    assert lines[-1].count("agent-0.ticks: File too large") == 1
-    assert "What of truth.bin, agent-0.ticks was not written is lost" in lines[-1]
+    assert [lines[-1].count(f"agent-{i}.ticks: File too large") for i in (0, 1)] == [1, 1]
+    assert "What of agent-0.ticks, agent-1.ticks, truth.bin was not written is lost" in lines[-1]
     assert "swarmctl report" not in lines[-1], "the rows were in memory"
     (tmp_path / "run" / "summary.json").unlink()
-    report_run(tmp_path / "run", Rules(agents=1, required_separation_m=0.5))
+    report_run(tmp_path / "run", Rules(agents=2, required_separation_m=0.5))
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (summary["outcome"], summary["mode"]) == ("failed", "lockstep")
 
@@ -46,7 +45,7 @@ def test_a_window_that_can_not_be_opened_changes_no_exit_code(
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     for code in (0, 4):
-        monkeypatch.setattr(verb, "simulate", lambda config, directory, code=code: code)
+        monkeypatch.setattr(verb, "simulate", lambda config, directory, jobs, code=code: code)
         assert verb.main(["--view", "--run-dir", str(tmp_path / f"run-{code}")]) == code
         assert f"rerun --port auto {tmp_path}/run-{code}/telemetry.rrd" in capsys.readouterr().err
 
@@ -54,7 +53,7 @@ def test_a_window_that_can_not_be_opened_changes_no_exit_code(
 def long_simulation(folder: Path) -> list[str]:
     """Return the command of one that is to be interrupted."""
     longer = ("--duration", "600", "--run-dir", str(folder))
-    return [sys.executable, "-m", "sitl.simulate", *SHORT[:2], *COARSE, *longer]
+    return [sys.executable, "-m", "sitl.simulate", "--agents", "2", "--jobs", "2", *COARSE, *longer]
 
 
 def until_it_flies(folder: Path) -> None:
@@ -81,13 +80,27 @@ def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:
     assert json.loads((folder / "summary.json").read_text())["outcome"] == "interrupted"
 
 
+def test_a_second_ctrl_c_ends_every_process_at_once(tmp_path: Path) -> None:
+    process = subprocess.Popen(long_simulation(tmp_path / "run"), stderr=subprocess.PIPE, start_new_session=True)
+    until_it_flies(tmp_path / "run")
+    time.sleep(1.0)
+    for _ in range(2):
+        os.killpg(process.pid, signal.SIGINT)
+        time.sleep(0.1)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert b"Traceback" not in told
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
+
+
 def test_a_simulation_that_flies_is_not_finished_by_a_report(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     process = subprocess.Popen(long_simulation(folder), stdout=subprocess.DEVNULL)
     until_it_flies(folder)
     time.sleep(1.0)  # until it heeds signals
     with pytest.raises(StartError, match="is still written"):
-        report_run(folder, Rules(agents=1, required_separation_m=0.5))
+        report_run(folder, Rules(agents=2, required_separation_m=0.5))
     process.send_signal(signal.SIGINT)
     assert process.wait(120) == 130
     assert json.loads((folder / "summary.json").read_text())["outcome"] == "interrupted"

@@ -1,4 +1,4 @@
-"""Numbers on the command lines of studies."""
+"""Numbers on the command lines of flights and studies."""
 
 from __future__ import annotations
 
