@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from sitl.studies.bench.bus_load import SIZES_BYTES, STATUS_TICKS, TICK_S
 from sitl.studies.bench.bus_over_hosts import processor_s
 from swarmctl.bus.bus import agent_name
 from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, RELAY, STATUS, TICK, TRAJECTORY, Topic
@@ -31,9 +32,8 @@ SESSIONS: dict[str, Callable[[], Callable[..., ZenohSession]]] = {
     "a session for each agent": lambda: ZenohSession,
     "one for each process": SharedSession,
 }
-SAID = {PATH: 632, TICK: 1500, STATUS: 2200}  # bytes, about as in flight
 HEARD = (PATH, STATUS, TRAJECTORY, RELAY)
-TICK_S, STATUS_TICKS, SETTLES_S = 0.02, 10, 1.0
+SETTLES_S = 1.0
 
 
 class Load(NamedTuple):
@@ -61,7 +61,7 @@ def tick_for_ever(endpoint: str, way: str, agents: int, own: Sequence[int]) -> N
             for topic in (*HEARD, COMMAND):
                 bus.receive(topic)
             bus.alive()
-            for topic, size in SAID.items():
+            for topic, size in SIZES_BYTES.items():
                 if topic is not STATUS or tick % STATUS_TICKS == 0:
                     bus.publish(topic, bytes(size))
         tick, due_s = tick + 1, due_s + TICK_S

@@ -26,8 +26,8 @@ from swarmctl.wall_clock import WallClock
 
 RUN = "bench"
 TICK_S = 0.02
-_SIZES_BYTES: Mapping[Topic, int] = {PATH: 534, TICK: 573, STATUS: 753}  # of three agents that fly a circle
-_STATUS_TICKS = 10
+SIZES_BYTES: Mapping[Topic, int] = {PATH: 534, TICK: 573, STATUS: 753}  # of three agents that fly a circle
+STATUS_TICKS = 10
 _HEARD = (PATH, STATUS)
 _SENT_AT_US = struct.Struct("<q")
 
@@ -61,8 +61,8 @@ def _bus(endpoint: str, identity: OwnIdentity, agents: int, own: int, clock: Wal
 
 
 def _publish(bus: Bus, tick: int, now_us: int) -> None:
-    for topic, size_bytes in _SIZES_BYTES.items():
-        if topic is not STATUS or tick % _STATUS_TICKS == 0:
+    for topic, size_bytes in SIZES_BYTES.items():
+        if topic is not STATUS or tick % STATUS_TICKS == 0:
             bus.publish(topic, _SENT_AT_US.pack(now_us).ljust(size_bytes, b"\0"))
 
 
