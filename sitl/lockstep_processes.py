@@ -42,12 +42,17 @@ class LockstepProcesses:
 
     Attributes:
         clock: the simulated one.
+
+    Raises:
+        StartError: a process did not start.
     """
 
     def __init__(self, config: Config, directory: Path | None, jobs: int) -> None:
         own, *others = _shares(config.swarm.agents, jobs)
-        self._workers = [_Worker(config, directory, part, number) for number, part in enumerate(others, 1)]
+        self._workers: list[_Worker] = []
         try:
+            for number, part in enumerate(others, 1):
+                self._workers.append(_started(config, directory, part, number))
             following = _Following(self._workers)
             self._lead = Lockstep(config, directory, part=own, others=following if others else None)
         except BaseException:
@@ -123,6 +128,18 @@ class _Worker:
         self._end.close()
         self._process.kill()
         self._process.join()
+
+
+def _started(config: Config, directory: Path | None, part: range, number: int) -> _Worker:
+    """Return a worker that runs.
+
+    Raises:
+        StartError: the system has no room for one more.
+    """
+    try:
+        return _Worker(config, directory, part, number)
+    except OSError as error:
+        raise StartError(f"--jobs: process {number + 1} did not start ({error.strerror}); give fewer") from error
 
 
 class _Following(OtherParts):

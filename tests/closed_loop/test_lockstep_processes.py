@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -124,6 +125,21 @@ def test_a_process_that_ends_by_itself_is_told_of() -> None:
         pytest.raises(StartError, match="agents 1 to 2: their process ended by itself"),
     ):
         flight.run(lambda: os.kill(workers()[0], signal.SIGKILL))
+    assert workers() == []
+
+
+def test_a_process_that_can_not_be_started_is_told_of_and_ends_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    fork, calls = os.fork, [0]
+
+    def full() -> int:
+        calls[0] += 1
+        if calls[0] == 2:
+            raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+        return fork()
+
+    monkeypatch.setattr(os, "fork", full)
+    with pytest.raises(StartError, match="process 3 did not start"):
+        LockstepProcesses(load(None, (*COARSE, "swarm.agents=3")), None, 3)
     assert workers() == []
 
 
