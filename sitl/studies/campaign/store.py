@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import ClassVar, Generic, Self, TypeVar
@@ -17,7 +18,7 @@ import pyarrow.parquet as pq
 
 from sitl.studies.campaign.trials import SCHEMA, Row, Trial, is_flown, trial_of
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.files import read_file, replaced
+from swarmctl.files import hold, read_file, replaced
 from swarmctl.telemetry.recording.file_names import STUDY_ROWS
 
 _SAVE_EVERY_S = 1.0
@@ -39,7 +40,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 class RowStore(Generic[_Job]):
-    """Rows of many flights; a context manager that saves the rest when it ends.
+    """Rows of many flights; a context manager that has the folder to itself, and saves the rest when it ends.
 
     Args:
         directory: made when it is missing.
@@ -63,25 +64,43 @@ class RowStore(Generic[_Job]):
         self.rows: list[Row] = []
         with writing(directory):
             directory.mkdir(parents=True, exist_ok=True)
-        if self._path.exists():
-            self.rows = _read(self._path, schema.names)
+        self._load()
         others = sorted({row["code"] for row in self.rows} - {code})
         if others and not mix:
             raise ConfigError(
                 str(self._path),
                 [f"flown by other sources ({', '.join(others)}; these are {code}): {self.advice}"],
             )
-        self._finished = {job_of(row) for row in self.rows if is_flown(row)}
-        self._unflown = {job_of(row) for row in self.rows} - self._finished
         self._saved_s, self._is_saved = time.monotonic(), True
+        self._held = ExitStack()
 
     def __enter__(self) -> Self:
+        """Keep other studies out of the folder, which would replace rows of this one by theirs alone.
+
+        Raises:
+            StartError: another one flies into it.
+        """
+        with writing(self._path.parent):
+            fd = os.open(self._path.parent, os.O_RDONLY | os.O_CLOEXEC)
+        self._held.callback(os.close, fd)
+        if not hold(fd):
+            self._held.close()
+            told = f"{self._path.parent}: another sweep or campaign flies into it"
+            raise StartError(f"{told}. Wait until it has ended, or choose another with --out")
+        self._load()  # one that has just ended may have added some
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.save()
+        with self._held:
+            self.save()
+
+    def _load(self) -> None:
+        if self._path.exists():
+            self.rows = _read(self._path, self._schema.names)
+        self._finished = {self._job_of(row) for row in self.rows if is_flown(row)}
+        self._unflown = {self._job_of(row) for row in self.rows} - self._finished
 
     def missing(self, jobs: Iterable[_Job]) -> list[_Job]:
         """Return the flights not flown yet, in order, each once; one that an error ended is flown again."""

@@ -222,6 +222,21 @@ def test_finished_runs_are_not_flown_again(tmp_path: Path) -> None:
     assert Store(tmp_path, "that", mix=True).missing(trials) == trials[5:]
 
 
+def test_two_campaigns_do_not_fly_into_one_folder(tmp_path: Path) -> None:
+    with (
+        Store(tmp_path, "this") as store,
+        pytest.raises(StartError, match="another sweep or campaign flies into it"),
+        Store(tmp_path, "this"),
+    ):
+        pass
+    late = Store(tmp_path, "this")
+    with store:
+        store.add(row_of(Trial(CELL, 1)))
+    with late:
+        late.add(row_of(Trial(CELL, 2)))
+    assert not Store(tmp_path, "this").missing([Trial(CELL, 1), Trial(CELL, 2)])
+
+
 def broken(trial: Trial) -> Row:
     if trial.seed == 2:
         raise RuntimeError("no such luck")
