@@ -18,6 +18,7 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.goal import REACHED_M
 from swarmctl.core.text import point_text
 from swarmctl.core.types import Array
+from swarmctl.mavlink.geofence import Geofence
 from swarmctl.telemetry.evaluation.referee import Rules
 
 _BEGINS_M = 0.5  # a reference that begins nearer to where its agent waits is as good as there
@@ -28,6 +29,8 @@ _SAME_M = 1e-6  # distances that differ by less are the same but for rounding
 _STEEP_RAD = 0.75  # a real PX4 has yawed at 44 degrees, and had no thrust left at 55
 _FALLS_HARDER = 1.25  # times what a vehicle falls by: 0.3 m of a plan of 0.8 s are not worth a word, 0.6 m are
 _ZERO = np.zeros(1)
+_HOMEWARD, _ON_THE_WAY = 120, 60  # times of a mission from which, and places at which, straight ways home are looked at
+_FINE_S = 0.06  # between two points of plans among which swaps of four and six keep their distance
 
 
 def config_warnings(config: Config) -> list[str]:
@@ -38,7 +41,7 @@ def config_warnings(config: Config) -> list[str]:
     references = config.mission.references(np.array(config.starts_ned_m()), config.separation.budget.planned_m)
     flown = [text for about in _ABOUT_REFERENCES for text in about(config, references)]
     judged = (*_judged_by_more_than_is_kept(config), *_stand_above_each_other(config))
-    vehicles = (*_turned_by_steep_tilt(config), *_planned_to_fall(config))
+    vehicles = (*_turned_by_steep_tilt(config), *_planned_to_fall(config), *_planned_too_coarsely(config))
     return [*found, *flown, *judged, *vehicles, *_counts_by_other_ticks(config)]
 
 
@@ -108,13 +111,41 @@ def _same_goals(config: Config, references: Sequence[MissionReference]) -> Itera
     yield from _first([f"{text}: not both arrive" for text in found], "pairs of goals are as near")
 
 
+def _crosses_notches(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
+    """Yield whose start and mission are in the fence, but not all that is between them, where it is dented."""
+    found, fence = [], config.geofence.area()
+    if fence is None:
+        return
+    t_s = np.linspace(0.0, config.mission.duration_s, _HOMEWARD)
+    for agent, (reference, start) in enumerate(zip(references, np.array(config.starts_ned_m()), strict=True)):
+        beyond_m = _beyond_on_way_m(fence, reference.sample(t_s)[0], start)
+        if beyond_m.max() > _SAME_M:
+            way = f"agent {agent}: from {t_s[np.argmax(beyond_m > _SAME_M)]:.0f} s on, its straight way home"
+            leads = f"(after the mission, by rtl, by a low battery) leads up to {beyond_m.max():.1f} m outside"
+            found.append(f"{way} {leads} of geofence.corners_ne_m; move the start, the mission, or the corners")
+    yield from _first(found, "straight ways home lead out of the fence")
+
+
+def _beyond_on_way_m(fence: Geofence, pos_ned_m: Array, home_ned_m: Array) -> Array:
+    """Return how far (K,) outside of a fence the straight ways from places (K, 3) to one (3,) lead at most."""
+    parts_01 = np.linspace(0.0, 1.0, _ON_THE_WAY)[:, None, None]
+    ways_ned_m = home_ned_m + parts_01 * (pos_ned_m - home_ned_m)
+    beyond_m = fence.beyond_m(ways_ned_m[..., :2].reshape(-1, 2))
+    return np.asarray(beyond_m.reshape(_ON_THE_WAY, len(pos_ned_m)).max(axis=0))
+
+
 def _swings_out(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:
-    """Yield whose way home leaves the fence: a mission that ends fast carries a vehicle beyond its end."""
+    """Yield whose way home leaves the fence: a mission that ends fast carries a vehicle beyond its end.
+
+    Where even a straight one does, that is told of elsewhere.
+    """
     found, fence, params = [], config.geofence.area(), config.agent.state_machine
     if fence is None:
         return
     for agent, (reference, start) in enumerate(zip(references, np.array(config.starts_ned_m()), strict=True)):
         pos, vel = reference.sample(np.array([config.mission.duration_s]))
+        if _beyond_on_way_m(fence, pos, start).max() > _SAME_M:
+            continue
         brake_m_s2 = min(config.separation.brake_m_s2, config.controller.mpc.accel_max_m_s2(config.model_of(agent)))
         limits = {"speed_m_s": params.speed_m_s, "accel_m_s2": params.accel_m_s2, "brake_m_s2": brake_m_s2}
         way = way_home(pos[0], vel[0], start, **limits)
@@ -267,6 +298,7 @@ _ABOUT_REFERENCES = (
     _begin_elsewhere,
     _cut_short,
     _same_goals,
+    _crosses_notches,
     _swings_out,
     _left_behind,
     _seen_too_late,
@@ -294,6 +326,19 @@ def _planned_to_fall(config: Config) -> Iterator[str]:
         falls = f"{key} = {planned_m_s2:g}: plans fall by up to {falls_m_s2:.2f} m/s2"
         has = f"vehicle_model.thrust_min_01 = {least_01:g} leaves {has_m_s2:.2f}"
         yield f"{falls}, {has}: the vehicle is above what it has told others. Raise it to {least_m_s2:.2f}"
+
+
+def _planned_too_coarsely(config: Config) -> Iterator[str]:
+    """Yield that the tilt of plans changes so seldom that several agents take turns in refusing each other's plans.
+
+    Commitments are planned by `agent.commit.dt_s`.
+    """
+    dt_s = config.controller.mpc.dt_s
+    several = config.swarm.agents > 1 and config.separation.mode != "guaranteed"
+    if several and config.controller.plans and dt_s > _FINE_S + _SAME_M:
+        coarse = f"controller.mpc.dt_s = {dt_s:g}: agents that meet others do not keep their distance"
+        flown = f"by 0.08 s four that swap places have come to 0.32 m, by {_FINE_S:g} s to 0.88 m"
+        yield f"{coarse}; {flown}. Lower it, and raise the horizons instead"
 
 
 def _counts_by_other_ticks(config: Config) -> Iterator[str]:

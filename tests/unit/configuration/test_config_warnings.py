@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -101,6 +102,20 @@ def test_a_way_home_that_leaves_the_fence_is_named(corner_m: int, outside: bool)
     fast = load(ROOT / "configs" / "x500_fast_circle.toml", [f"geofence.corners_ne_m={corners}"])
     (said,) = config_warnings(fast) or [""]
     assert ("agent 0: after the mission, at 7.5 m/s, its way home leads " in said) is outside
+
+
+@pytest.mark.parametrize(("notch_m", "crossed"), [(5, True), (40, False)])
+def test_a_way_home_across_a_notch_of_the_fence_is_named(notch_m: int, crossed: bool) -> None:
+    """From the north to the east by a corner: the straight way back is in the fence at first, and not later on."""
+    corners = f"[[-5,-5],[40,-5],[40,{notch_m}],[{notch_m},{notch_m}],[{notch_m},40],[-5,40]]"
+    flown = "mission.waypoints.lists=[{points_ned_m=[[30,0,-3],[0,0,-3],[0,30,-3]]}]"
+    mission = ("mission.kind=waypoints", "mission.duration_s=60", flown)
+    fence = ("start.positions_ned_m=[[30,0,-3]]", "swarm.agents=1", f"geofence.corners_ne_m={corners}")
+    said = lines(*mission, *fence)
+    assert len(said) == crossed
+    assert all(
+        re.match(r"agent 0: from \d\d s on, its straight way home .* leads up to \d+\.\d m out", line) for line in said
+    )
 
 
 @pytest.mark.parametrize(
@@ -248,6 +263,16 @@ def test_plans_that_fall_harder_than_the_vehicle_are_named(given: tuple[str, ...
 )
 def test_negative_control_who_falls_as_planned_is_not(given: tuple[str, ...]) -> None:
     assert lines(*given) == []
+
+
+@pytest.mark.parametrize(("dt_s", "named"), [(0.08, True), (0.06, False)])
+def test_plans_too_coarse_for_agents_that_meet_are_named(dt_s: float, named: bool) -> None:
+    given = f"controller.mpc.dt_s={dt_s}"
+    assert [said.startswith(f"controller.mpc.dt_s = {dt_s}: agents that meet") for said in lines(given)] == [
+        True
+    ] * named
+    committed = ("separation.mode=guaranteed", "separation.radius_m=0.95")
+    assert lines(given, "swarm.agents=1") == lines(given, *committed) == []
 
 
 def begins_at(tmp_path: Path, z_m: float, *overrides: str) -> list[str]:
