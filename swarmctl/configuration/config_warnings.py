@@ -250,15 +250,15 @@ def _seen_too_late(config: Config, references: Sequence[MissionReference]) -> It
     With guaranteed separation, that is later than the agent commits to fly there: it leaves a commitment only as far as
     those of its peers allow.
     """
-    t_s = np.linspace(0.0, config.mission.duration_s, _SAMPLES)
-    flown = [reference.sample(t_s) for reference in references if config.obstacles]
+    t_s = np.append(np.zeros(_ON_THE_WAY), np.linspace(0.0, config.mission.duration_s, _SAMPLES))
+    flown = [_flown_to_and_on(config, *one, t_s[_ON_THE_WAY:]) for one in enumerate(references) if config.obstacles]
     commits = config.separation.mode == "guaranteed"
     for number, obstacle in enumerate(config.obstacles):
         room_m, center_ned_m = obstacle.visibility_m - obstacle.keep_out_m, obstacle.center_after(t_s[:, None])
         for agent, (pos_ned_m, vel_ned_m_s) in enumerate(flown):
             sees = np.linalg.norm((pos_ned_m - center_ned_m)[:, : obstacle.axes], axis=1) < obstacle.visibility_m
-            towards_m_s = np.linalg.norm(vel_ned_m_s - np.array(obstacle.vel_ned_m_s), axis=1)
-            speed_m_s = float(towards_m_s[sees].max(initial=0.0))
+            towards_m_s = sees * np.linalg.norm(vel_ned_m_s - np.array(obstacle.vel_ned_m_s), axis=1)
+            speed_m_s = float(towards_m_s.max())
             stop_m = speed_m_s**2 / (2.0 * config.controller.mpc.accel_max_m_s2(config.model_of(agent)))
             ahead_m = config.agent.commit.stretch_m(speed_m_s) if commits else stop_m
             if ahead_m > room_m:
@@ -268,8 +268,27 @@ def _seen_too_late(config: Config, references: Sequence[MissionReference]) -> It
                     if commits
                     else f"from which it stops in {stop_m:.2f} m"
                 )
-                yield f"{seen}, at {speed_m_s:.1f} m/s, {stops}; raise visibility_m"
+                joins = towards_m_s.argmax() < _ON_THE_WAY
+                speed = f"{speed_m_s:.1f} m/s{' as it catches up with its reference' if joins else ''}"
+                yield f"{seen}, at {speed}, {stops}; raise visibility_m{', or start nearer' if joins else ''}"
                 break
+
+
+def _flown_to_and_on(config: Config, agent: int, reference: MissionReference, t_s: Array) -> tuple[Array, Array]:
+    """Return positions and velocities (K, 3) on an agent's straight way to where its reference begins, then on that.
+
+    To one that begins away from it, an agent accelerates for half of the way, and brakes for the other half.
+    """
+    start, model = np.array(config.starts_ned_m()[agent]), config.model_of(agent)
+    pos, vel = reference.sample(t_s)
+    way = pos[0] - start
+    away_m, done_01 = float(np.linalg.norm(way)), np.linspace(0.0, 1.0, _ON_THE_WAY)
+    if away_m < _BEGINS_M:
+        return np.vstack([np.tile(start, (_ON_THE_WAY, 1)), pos]), np.vstack([np.zeros((_ON_THE_WAY, 3)), vel])
+    nearer_m = away_m * np.minimum(done_01, 1.0 - done_01)
+    speed_m_s = np.sqrt(2.0 * config.controller.mpc.accel_max_m_s2(model) * nearer_m)
+    joining = np.minimum(speed_m_s, model.speed_max_m_s)[:, None] * way / away_m
+    return np.vstack([start + done_01[:, None] * way, pos]), np.vstack([joining, vel])
 
 
 def _kept_apart_by_nobody(config: Config, references: Sequence[MissionReference]) -> Iterator[str]:

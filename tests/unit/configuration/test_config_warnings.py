@@ -165,6 +165,19 @@ def test_an_obstacle_on_the_way_that_is_seen_too_late_is_named(speed_m_s: float,
     assert lines(*alone, tilts, "sitl.start=air", aside) == []
 
 
+@pytest.mark.parametrize(("away_m", "is_named"), [(60, True), (0, False)])
+def test_an_obstacle_on_the_way_to_a_reference_that_begins_elsewhere_is_named(away_m: int, is_named: bool) -> None:
+    """One that caught up with a circle 60 m away, at 9.6 m/s, passed it 0.74 m from its centre, of a radius of 1 m."""
+    circle = f"mission.circle={{center_ned_m=[{away_m},0,-2],radius_m=3,climb_ned_m_s=0.0}}"
+    alone = ("swarm.agents=1", "sitl.start=air", "start.positions_ned_m=[[3,0,-2]]", circle, "mission.kind=circle")
+    on_the_way, aside = (f"obstacles=[{{center_ned_m=[{away_m // 2 + 1},{east},-2]}}]" for east in (0.4, 20.0))
+    named = [
+        " as it catches up with its reference, from which it stops in " in line for line in lines(*alone, on_the_way)
+    ]
+    assert named == [True] * is_named
+    assert lines(*alone, aside) == []
+
+
 def test_an_obstacle_that_is_seen_later_than_is_committed_is_named() -> None:
     """Three in formation, one of them straight at it, came 0.2 m closer than they certify; seen from afar none does."""
     goto = "mission.goto={goals_ned_m=[[60,0,0]],speed_m_s=1.5}"
