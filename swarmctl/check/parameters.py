@@ -88,7 +88,7 @@ def _opinions(facts: VehicleFacts, config: Config) -> dict[str, Opinion]:
 
 def _context(facts: VehicleFacts, config: Config) -> ParameterContext:
     """Return what the checks of a dialect may depend on."""
-    sensors, version, model = facts.sensors, facts.version, config.vehicle_model
+    sensors, version, model = facts.sensors, facts.version, config.model_of(facts.agent)
     return ParameterContext(
         number=facts.number,
         has_radio=sensors is not None and bool(sensors.present & sensors.healthy & RC_RECEIVER),
@@ -97,6 +97,7 @@ def _context(facts: VehicleFacts, config: Config) -> ParameterContext:
         wanted_sysid=facts.wanted_sysid,
         hover_thrust_01=model.hover_thrust_01,
         tilt_max_rad=model.tilt_max_rad,
+        model_key=config.model_key(facts.agent),
     )
 
 
@@ -119,7 +120,8 @@ def _as_configured(name: str, facts: VehicleFacts, config: Config, rule: Rule | 
     if broken:
         return Opinion(verdict=Verdict.FIX, wanted=wanted, advice=f"the configuration asks for it: {broken}")
     if value is None:
-        remove = f"this autopilot has no such parameter: remove agent.autopilot_params.{name}"
+        others = "" if config.swarm.agents == 1 else ", unless it is for other vehicles"
+        remove = f"this autopilot has no such parameter: remove agent.autopilot_params.{name}{others}"
         told = (facts.parameters or {}).get(name)  # ArduCopters say nothing of parameters that they don't have
         is_known = told is not None and told.refused
         advice = remove if is_known else f"not answered: look at the loss of the link, unless {remove}"

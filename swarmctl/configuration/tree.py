@@ -115,6 +115,10 @@ class Config(Params):
         own = self.vehicles[agent].model if self.vehicles else None
         return own or self.vehicle_model
 
+    def model_key(self, agent: int) -> str:
+        """Return the key of the section that `model_of` reads."""
+        return f"vehicles.{agent}.model" if self.vehicles and self.vehicles[agent].model else "vehicle_model"
+
     def simulator(self, agents: Sequence[int] = ()) -> SimulatorConfig:
         """Return what the simulator of this run is told.
 

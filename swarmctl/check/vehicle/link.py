@@ -104,7 +104,7 @@ def latency(facts: VehicleFacts, config: Config) -> Finding:
         advice = f"states would be older than agent.failsafe.state_max_age_s = {oldest_ms / 1e3:g}: use a quicker link"
         return line(FIX, found, advice, 70)
     if trip.p50_ms / 2 > tick_ms:
-        return line(NOTE, found, f"add {trip.p50_ms / 2e3:.3f} s of it to vehicle_model.delay_s", 7)
+        return line(NOTE, found, f"add {trip.p50_ms / 2e3:.3f} s of it to {config.model_key(facts.agent)}.delay_s", 7)
     return line(OK, found)
 
 

@@ -87,14 +87,14 @@ def _arming_check(value: float, seen: ParameterContext) -> Opinion:
 
 def _angle_max(value: float, seen: ParameterContext) -> Opinion:
     least = math.degrees(seen.tilt_max_rad) * 100
-    wanted = f"at least {least:.0f} (vehicle_model.tilt_max_rad)"
+    wanted = f"at least {least:.0f} ({seen.model_key}.tilt_max_rad)"
     if value >= least - 1:
         return ok(wanted)
     lower = math.floor(math.radians(value / 100) * 100) / 100
     return Opinion(
         verdict=Verdict.NOTE,
         wanted=wanted,
-        advice=f"the autopilot clips; set vehicle_model.tilt_max_rad = {lower:g} or raise it",
+        advice=f"the autopilot clips; set {seen.model_key}.tilt_max_rad = {lower:g} or raise it",
     )
 
 

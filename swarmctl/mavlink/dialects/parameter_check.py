@@ -34,6 +34,7 @@ class ParameterContext:
     wanted_sysid: int
     hover_thrust_01: float  # of the configuration
     tilt_max_rad: float  # of the configuration
+    model_key: str  # of the section that has both
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +54,13 @@ def ok(wanted: str) -> Opinion:
 def assess_hover(value: float, seen: ParameterContext) -> Opinion:
     """Compare the autopilot's hover thrust with the configured one."""
     ours = seen.hover_thrust_01
-    wanted = f"vehicle_model.hover_thrust_01 = {ours:g}"
+    wanted = f"{seen.model_key}.hover_thrust_01 = {ours:g}"
     if abs(value - ours) <= _HOVER_APART_01:
         return ok(wanted)
     return Opinion(
         verdict=Verdict.NOTE,
         wanted=wanted,
-        advice=f"first guesses differ; set vehicle_model.hover_thrust_01 = {value:g}",
+        advice=f"first guesses differ; set {seen.model_key}.hover_thrust_01 = {value:g}",
     )
 
 

@@ -37,6 +37,7 @@ from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import _drawn, as_json, print_check
 from swarmctl.config import Config, load
 from swarmctl.control.failsafe.decision import FailsafeParams
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.mavlink_values import RC_RECEIVER
 from swarmctl.core.types import FlightMode, Landed
@@ -405,6 +406,24 @@ def test_arducopter_rows(config: Config, topic: str, fields: dict[str, Any], ver
     found = line_of(findings([changed(COPTER, **fields)], plain), topic)
     assert found.verdict is verdict
     assert word in found.advice
+
+
+def test_a_vehicle_with_a_model_of_its_own_is_compared_with_that(config: Config) -> None:
+    second = config.vehicles[1].model_copy(update={"model": VehicleModelParams(hover_thrust_01=0.3, tilt_max_rad=0.4)})
+    own = with_params(config.model_copy(update={"vehicles": (config.vehicles[0], second)}))
+    facts = [dataclasses.replace(COPTER, agent=agent) for agent in (0, 1)]
+    lines = findings(facts, own)
+    assert line_of(lines, "MOT_THST_HOVER", 0).wanted.startswith("vehicle_model.hover_thrust_01 = 0.5")
+    hover = line_of(lines, "MOT_THST_HOVER", 1)
+    assert hover.wanted.startswith("vehicles.1.model.hover_thrust_01 = 0.3")
+    assert hover.advice == "first guesses differ; set vehicles.1.model.hover_thrust_01 = 0.45"
+    assert line_of(lines, "ANGLE_MAX", 1).wanted.startswith("at least 2292 (vehicles.1.model.tilt_max_rad)")
+
+
+def test_a_parameter_of_other_vehicles_autopilots_is_not_to_be_removed(config: Config) -> None:
+    both = with_params(config, COM_OBL_RC_ACT=4, GUID_OPTIONS=8)
+    advice = line_of(findings([HEALTHY], both), "GUID_OPTIONS").advice
+    assert advice.endswith("remove agent.autopilot_params.GUID_OPTIONS, unless it is for other vehicles")
 
 
 def test_every_judged_parameter_has_a_case() -> None:
