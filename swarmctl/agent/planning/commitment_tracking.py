@@ -60,7 +60,8 @@ class CommitmentTracking:
         self._error_m = error_m = float(np.linalg.norm(state.pos_ned_m - pos))
         error_m_s = float(np.linalg.norm(state.vel_ned_m_s - vel))
         late_m = math.dist(pos, commitments.flown.at(state_utc_us)[0])
-        if self._tube.update(utc_us, error_m, error_m_s, late_m):
+        speed_m_s = float(np.linalg.norm(state.vel_ned_m_s))
+        if self._tube.update(utc_us, error_m, error_m_s, late_m, speed_m_s=speed_m_s):
             commitments.restart(state.pos_ned_m, state.vel_ned_m_s, state_utc_us)
         before, self.grip = self.grip, self._tube.grip(utc_us)
         if self.grip is not before:

@@ -7,8 +7,9 @@ and that it regains little by little. A vehicle that merely lags need not hurry,
 (`Commitments.wait_for`): it is on its way to the places it has committed to.
 
 A vehicle that is blown away, or far outside, no longer flies what it has committed to. One that is less far had better
-return: its commitment keeps clear of all others, a new one from beside it may not. What follows depends on how
-often a commitment is lost:
+return: its commitment keeps clear of all others, a new one from beside it may not. But one that rests there, and comes
+no nearer, never will, as where it has evaded to beyond the flight volume, which it is flown back into. Peers
+keep clear of the wider tube, where it is. What follows depends on how often a commitment is lost:
 
 1. *widen*: it commits anew, from the state that was measured, and goes on;
 2. *stop*: it proposes nothing until it has lost none for a while, and so rests where it stops;
@@ -28,6 +29,8 @@ _BLOWN_M, _BLOWN_M_S = 0.15, 1.0  # outside the tube, and moving away: gusts do 
 _FAR_M = 0.5  # outside the tube, however slowly; trackers of real autopilots lag by 0.27 m at most (PX4 1.18)
 _SLOWS_M, _STANDS_M = 0.03, 0.13  # outside the tube: where it begins to plan to be slower, and plans to stand
 _REGAINED_S = 2.0  # time in which it then goes from rest to its full pace again
+_RESTS_M_S, _NEARER_M = 0.1, 0.02  # outside the tube: slower a vehicle rests, by more it comes nearer
+_PATIENCE_US = 3_000_000  # for which a vehicle may rest there: peers have planned anew since it does
 _HELD_US = 1_000_000  # nothing lost for this long: what is committed is held again
 _WINDOW_US = 10_000_000
 _STOPS_AT, _LANDS_AT = 3, 40  # how often a commitment has been lost within that window
@@ -60,15 +63,19 @@ class Tube:
         self._lost_us: deque[int] = deque()
         self._updated_us: int | None = None
         self._is_outside = False
+        self._nearest_m, self._nearest_us = math.inf, 0  # to what is committed since it rests outside, and when
         self.radius_m, self.worst_m, self.pace_01 = nominal_m, 0.0, 1.0
 
-    def update(self, utc_us: int, error_m: float, error_m_s: float, late_m: float = 0.0) -> bool:
+    def update(
+        self, utc_us: int, error_m: float, error_m_s: float, late_m: float = 0.0, *, speed_m_s: float = math.inf
+    ) -> bool:
         """Take in the deviation from the committed trajectory, of position and of velocity.
 
         Args:
             utc_us: now.
             error_m, error_m_s: deviations.
             late_m: how far behind the committed trajectory the vehicle is flown along it, because it lags.
+            speed_m_s: of the vehicle.
 
         Returns:
             whether the commitment is lost, so that the vehicle has to commit anew.
@@ -87,9 +94,17 @@ class Tube:
         regained_01 = self.pace_01 + 1e-6 * since_us / _REGAINED_S
         self.pace_01 = max(0.0, min(1.0, regained_01, (_STANDS_M - beyond_m) / (_STANDS_M - _SLOWS_M)))
         is_lost = beyond_m > _FAR_M or (beyond_m - late_m > _BLOWN_M and error_m_s > _BLOWN_M_S)
+        is_lost |= self._rests_in_vain(utc_us, error_m, speed_m_s)
         if is_lost:
             self._lost_us.append(utc_us)
         return is_lost
+
+    def _rests_in_vain(self, utc_us: int, error_m: float, speed_m_s: float) -> bool:
+        """Return whether the vehicle has long rested outside the tube, and come no nearer to its commitment."""
+        rests = self._is_outside and speed_m_s < _RESTS_M_S
+        if not rests or error_m < self._nearest_m - _NEARER_M:
+            self._nearest_m, self._nearest_us = error_m, utc_us
+        return utc_us - self._nearest_us > _PATIENCE_US
 
     def grip(self, utc_us: int) -> Grip:
         """Return how well the vehicle follows its commitments now."""

@@ -104,3 +104,22 @@ def test_losses_long_ago_do_not_count() -> None:
     for t_us in times_us.tolist():
         tube.update(t_us, 0.8, 1.0)
         assert tube.grip(t_us) is Grip.WIDENED, "at most two in any 10 s"
+
+
+@pytest.mark.parametrize(
+    ("errors_m", "speed_m_s", "lost"),
+    [([0.5] * 250, 0.0, True), ([0.5] * 140, 0.0, False), ([0.5] * 250, 0.2, False), ([0.2] * 250, 0.0, False)],
+    ids=["rests", "not long enough", "moves", "inside"],
+)
+def test_a_vehicle_that_rests_outside_for_ever_commits_anew(
+    errors_m: list[float], speed_m_s: float, lost: bool
+) -> None:
+    """One that had evaded out of the flight volume, and was kept in it, waited 0.42 m from there till it was landed."""
+    tube = Tube(NOMINAL_M)
+    ticks = enumerate(errors_m)
+    assert any(tube.update(k * TICK_US, error_m, 0.16, speed_m_s=speed_m_s) for k, error_m in ticks) is lost
+
+
+def test_negative_control_one_that_comes_back_slowly_does_not() -> None:
+    tube, errors_m = Tube(NOMINAL_M), np.linspace(0.6, 0.2, 500)
+    assert not any(tube.update(k * TICK_US, float(e), 0.05, speed_m_s=0.05) for k, e in enumerate(errors_m))
