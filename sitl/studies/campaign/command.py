@@ -43,6 +43,12 @@ _AXES = (  # options that --quick has its own values of
     *("scenario", "agents", "delay", "loss", "noise", "wind", "protections"),
     *("airframe", "disturbance", "sets", "trials", "first_seed"),
 )
+_OF_OPTIONS = {  # keys that tell cells or trials apart: the rows would tell other values than were flown
+    "seed": "--first-seed",
+    "swarm.agents": "--agents",
+    "bus.delay_ms": "--delay",
+    "bus.loss_01": "--loss",
+}
 _Value = TypeVar("_Value")
 
 
@@ -88,6 +94,8 @@ def _trials(options: argparse.Namespace) -> list[Trial]:
         return list(QUICK)
     if spaced := [item for item in options.sets if item.split() != [item]]:
         raise ConfigError("--set", [f"{item!r}: write it without spaces" for item in spaced])
+    if asked := [key for key in (item.partition("=")[0] for item in options.sets) if key in _OF_OPTIONS]:
+        raise ConfigError("--set", [f"{key} is told by {_OF_OPTIONS[key]}; give it there" for key in asked])
     found: list[Cell] = []
     for name in options.scenario:
         agents = options.agents or SCENARIOS[name].agents

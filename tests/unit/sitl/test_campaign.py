@@ -34,7 +34,7 @@ from swarmctl.bus.messages.json_messages import MAX_OBSTACLES
 from swarmctl.config import load
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.errors import ConfigError, StartError
+from swarmctl.errors import EXIT_USAGE, ConfigError, StartError
 
 CELL = Cell(scenario="swap", agents=3, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="default")
 SWAP = replace(CELL, agents=6, protections="guaranteed")
@@ -235,6 +235,17 @@ def test_two_campaigns_do_not_fly_into_one_folder(tmp_path: Path) -> None:
     with late:
         late.add(row_of(Trial(CELL, 2)))
     assert not Store(tmp_path, "this").missing([Trial(CELL, 1), Trial(CELL, 2)])
+
+
+@pytest.mark.parametrize(
+    ("key", "option"),
+    [("seed", "--first-seed"), ("swarm.agents", "--agents"), ("bus.delay_ms", "--delay"), ("bus.loss_01", "--loss")],
+)
+def test_what_rows_tell_of_a_flight_is_not_set_to_something_else(
+    key: str, option: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["--trials", "1", "--out", str(tmp_path), "--set", f"{key}=0.5"]) == EXIT_USAGE
+    assert capsys.readouterr().err == f"--set: {key} is told by {option}; give it there\n"
 
 
 def broken(trial: Trial) -> Row:
