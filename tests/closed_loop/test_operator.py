@@ -109,12 +109,41 @@ def test_an_agent_goes_to_a_point_through_the_others_and_resume_continues_the_mi
     assert np.linalg.norm(pos[:, 0] - pos[:, 1], axis=1).min() >= 0.85
 
 
-def in_the_air(height_m: float) -> Lockstep:
+def in_the_air(height_m: float, config: str | None = None) -> Lockstep:
     """Return a flight of one agent that hovers in the air at its start and begins its mission."""
     hover = (*COARSE, "swarm.agents=1", "mission.kind=hover", "mission.duration_s=3", "sitl.start=air")
-    flight = Lockstep(load(None, (*hover, f"start.positions_ned_m=[[0,0,{-height_m}]]")))
+    path = None if config is None else ROOT / "configs" / config
+    flight = Lockstep(load(path, (*hover, f"start.positions_ned_m=[[0,0,{-height_m}]]")))
     fly_until(flight, lambda: phase(flight) is Phase.TRACK)
     return flight
+
+
+@pytest.mark.parametrize("config", [None, "ardupilot_sitl.toml"], ids=["px4", "arducopter"])
+def test_a_long_goto_takes_its_length_at_its_speed_and_does_not_pass_its_goal(config: str | None) -> None:
+    """60 m at 2 m/s take 32.4 s; a single quintic, which is as fast in its middle only, takes 56 s."""
+    flight, goal = in_the_air(5.0, config), np.array([60.0, 0.0, -5.0])
+    flight.command("goto", 0, north_m=60.0, east_m=0.0, down_m=-5.0, speed_m_s=2.0)
+    fly_until(flight, lambda: bool(np.linalg.norm(vehicle(flight)[0] - goal) < 0.1), 33.0)
+    fly_for(flight, 4.0)
+    flown = flight.truth.reshape(-1, 1)[:, 0]
+    assert flown["pos_ned_m"][:, 0].max() < 60.0 + 0.02
+    assert np.abs(flown["pos_ned_m"][:, 1:] - goal[1:]).max() < 0.05
+    assert np.linalg.norm(flown["vel_ned_m_s"], axis=1).max() < 2.0 + 0.05
+
+
+@pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
+def test_two_whose_long_ways_cross_keep_apart_and_arrive(mode: str) -> None:
+    """At 2 m/s both are cruising as they would meet."""
+    starts = ("swarm.agents=2", "start.positions_ned_m=[[-12,0,-3],[0,-12,-3]]", f"separation.mode={mode}")
+    flight = Lockstep(load(None, (*COARSE, *starts, "mission.kind=hover", "mission.duration_s=3", "sitl.start=air")))
+    fly_until(flight, lambda: phase(flight) is Phase.TRACK and phase(flight, 1) is Phase.TRACK)
+    for agent, (north_m, east_m) in enumerate(goals := ((12.0, 0.0), (0.0, 12.0))):
+        flight.command("goto", agent, north_m=north_m, east_m=east_m, down_m=-3.0)
+    ends = [np.array([*goal, -3.0]) for goal in goals]
+    fly_until(flight, lambda: all(np.linalg.norm(vehicle(flight, i)[0] - ends[i]) < 0.15 for i in range(2)), 20.0)
+    pos = flight.truth.reshape(-1, 2)["pos_ned_m"]
+    apart_m = np.linalg.norm(pos[:, 0] - pos[:, 1], axis=1).min()
+    assert 0.85 <= apart_m < 3.0, "they meet, and make way"
 
 
 def test_rtl_on_the_way_out_turns_round_and_lands_at_home_however_far_that_is() -> None:

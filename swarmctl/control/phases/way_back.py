@@ -12,11 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from swarmctl.control.reference.mission import MissionReference
-from swarmctl.control.reference.quintic import out_and_back, quintic_to, to_target
+from swarmctl.control.reference.quintic import bend_to_target, out_and_back, quintic_to, to_target
 from swarmctl.core.types import Array, VehicleState
 
-_POINTS = 60  # of a way whose speed and acceleration are checked
+_POINTS = 60  # of a way whose speed and acceleration are checked, beside those of its cruise
+_CRUISE_POINTS = 30
 _LONGER, _MOST_LONGER = 1.15, 16  # factor of a travel time that is too short, and how often
+_ROUNDING_M_S = 1e-9  # a cruise is at the peak speed
 _TURNS_ROUND = 1.6  # peak acceleration of a quintic whose first velocity leads elsewhere, over the one asked for
 
 
@@ -29,6 +31,7 @@ class WayBack:
     vel_ned_m_s: Array  # (3,)
     travel_s: float
     shed_s: float  # time in which the first velocity decays
+    cruise_s: float = 0.0  # part of travel_s in which the share of the reference grows steadily
 
     def elapsed_s(self, now_us: int) -> float:
         """Return the time since it began."""
@@ -41,31 +44,43 @@ class WayBack:
             t_s: times.
             pos_ned_m, vel_ned_m_s: of the reference, (K, 3) at these times.
         """
-        share, slope = to_target(t_s / self.travel_s)
+        share, slope = to_target(t_s, self.travel_s, self.cruise_s)
         coast, coast_slope = out_and_back(t_s / self.shed_s)
-        away = pos_ned_m - self.from_ned_m
+        away, ramps_s = pos_ned_m - self.from_ned_m, self.travel_s - self.cruise_s
         pos = self.from_ned_m + share * away + coast * (self.shed_s * self.vel_ned_m_s)
-        vel = share * vel_ned_m_s + slope * away / self.travel_s + coast_slope * self.vel_ned_m_s
+        vel = share * vel_ned_m_s + slope * away / ramps_s + coast_slope * self.vel_ned_m_s
         return pos, vel
 
-    def is_flown(self, pos_ned_m: Array, vel_ned_m_s: Array, speed_m_s: float, accel_m_s2: float) -> bool:
+    def checked_s(self) -> Array:
+        """Return the times (K,) at which speed and acceleration are checked, close together where it accelerates."""
+        ramps_s = self.travel_s - self.cruise_s
+        if self.cruise_s <= ramps_s:
+            return np.linspace(0.0, self.travel_s, _POINTS)
+        ramp_s, cruise_s = (
+            np.linspace(0.0, 0.5 * ramps_s, _POINTS // 2),
+            np.linspace(0.0, self.cruise_s, _CRUISE_POINTS),
+        )
+        return np.concatenate([ramp_s, 0.5 * ramps_s + cruise_s[1:-1], self.travel_s - ramp_s[::-1]])
+
+    def is_flown(self, t_s: Array, pos_ned_m: Array, vel_ned_m_s: Array, speed_m_s: float, accel_m_s2: float) -> bool:
         """Return whether speed and acceleration stay near what a transit has, beside those of the reference.
 
         A reference that flies away has to be overtaken, which takes almost twice its speed however long the way takes.
 
         Args:
-            pos_ned_m, vel_ned_m_s: reference, (K, 3) at times from 0 to `travel_s`.
+            t_s: times `checked_s` (K,).
+            pos_ned_m, vel_ned_m_s: of the reference, (K, 3) at these times.
             speed_m_s, accel_m_s2: peaks of a transit.
         """
-        s = np.linspace(0.0, 1.0, len(pos_ned_m))[:, None]
-        share, slope = to_target(s[:, 0])
-        bend = 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
+        share, slope = to_target(t_s, self.travel_s, self.cruise_s)
+        ramps_s = self.travel_s - self.cruise_s
         away = pos_ned_m - self.from_ned_m
-        vel = share * vel_ned_m_s + slope * away / self.travel_s
-        its_own_m_s2 = np.gradient(vel_ned_m_s, self.travel_s / (len(s) - 1), axis=0)
-        joining_m_s2 = bend * away / self.travel_s**2 + 2.0 * slope * vel_ned_m_s / self.travel_s
+        vel = share * vel_ned_m_s + slope * away / ramps_s
+        its_own_m_s2 = np.gradient(vel_ned_m_s, t_s, axis=0)
+        bend = bend_to_target(t_s, self.travel_s, self.cruise_s)
+        joining_m_s2 = bend * away / ramps_s**2 + 2.0 * slope * vel_ned_m_s / ramps_s
         fastest_m_s, most_m_s2 = _longest(vel_ned_m_s), _TURNS_ROUND * accel_m_s2 + _longest(its_own_m_s2)
-        slow = _longest(vel) <= fastest_m_s + max(speed_m_s, fastest_m_s)
+        slow = _longest(vel) <= fastest_m_s + max(speed_m_s, fastest_m_s) + _ROUNDING_M_S
         return slow and _longest(joining_m_s2 + share * its_own_m_s2) <= most_m_s2
 
 
@@ -100,12 +115,13 @@ def way_back(
         vel_ned_m_s=first_m_s,
         travel_s=max(transit.travel_s, 3.0 * _longest(vel) / accel_m_s2),
         shed_s=shed_s,
+        cruise_s=transit.cruise_s,
     )
     for _ in range(_MOST_LONGER):
-        reference = mission.sample(mission_t_s + np.linspace(0.0, way.travel_s, _POINTS))
-        if way.is_flown(*reference, speed_m_s, accel_m_s2):
+        t_s = way.checked_s()
+        if way.is_flown(t_s, *mission.sample(mission_t_s + t_s), speed_m_s, accel_m_s2):
             break
-        way = replace(way, travel_s=_LONGER * way.travel_s)
+        way = replace(way, travel_s=_LONGER * way.travel_s, cruise_s=_LONGER * way.cruise_s)
     return way
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -198,6 +199,83 @@ def test_a_first_velocity_carries_no_farther_when_the_way_is_long(target_m: list
     _, velocity, accel = derivatives(trajectory)
     assert np.linalg.norm(accel, axis=1).max() < 1.6 * 1.2
     np.testing.assert_allclose(velocity[0], [0.0, 0.0, 2.2], atol=0.01)
+
+
+def test_a_long_way_is_cruised_at_the_peak_speed_and_takes_its_time_at_that_and_of_speeding_up() -> None:
+    target = np.array([120.0, -160.0, 0.0])
+    trajectory = quintic_to(np.zeros(3), np.zeros(3), target, 2.0, accel_m_s2=1.2)
+    assert trajectory.travel_s == pytest.approx(100.0 + 2.4, abs=0.1)  # one quintic alone takes 187.5 s
+    pos, vel = trajectory.sample(np.array([0.0, 10.0, 51.2, 90.0, trajectory.travel_s, 1000.0]))
+    np.testing.assert_allclose(pos[[0, -2, -1]], [np.zeros(3), target, target], atol=1e-9)
+    np.testing.assert_allclose(vel[1:4], [[1.2, -1.6, 0.0]] * 3, atol=1e-9)
+    np.testing.assert_allclose(vel[[0, -2, -1]], 0.0, atol=1e-9)
+    said, velocity, accel = derivatives(trajectory)
+    np.testing.assert_allclose(said, velocity, atol=1e-6)
+    assert np.linalg.norm(said, axis=1).max() <= 2.0 + 1e-9
+    assert np.linalg.norm(accel, axis=1).max() <= 1.2 + 1e-6
+
+
+@pytest.mark.parametrize("vel", [[0.0, 0.0, 0.0], [0.5, -0.3, 0.1], [-2.0, 0.5, 0.0]])
+def test_a_cruise_is_joined_and_left_without_a_jump(vel: list[float]) -> None:
+    trajectory = quintic_to(FROM, np.array(vel), FROM + np.array([40.0, 0.0, 3.0]), 2.0, accel_m_s2=1.2)
+    speeds_up_s, step_s = 0.5 * (trajectory.travel_s - trajectory.cruise_s), 1e-5
+    for joint_s in (speeds_up_s, speeds_up_s + trajectory.cruise_s, trajectory.travel_s):
+        pos, said = trajectory.sample(joint_s + step_s * np.arange(-4.0, 5.0))
+        velocity, accel = np.diff(pos, axis=0) / step_s, np.diff(said, axis=0) / step_s
+        assert np.abs(np.diff(velocity, axis=0)).max() < 1e-4
+        assert np.abs(np.diff(accel, axis=0)).max() < 1e-3
+    np.testing.assert_allclose(trajectory.sample(np.zeros(1))[1][0], vel, atol=1e-12)
+
+
+@pytest.mark.parametrize("vel", [[0.0, 0.0, 0.0], [0.6, 0.0, 0.0], [-1.0, 1.5, 0.0], [0.0, -4.0, 0.0]])
+def test_the_first_way_with_a_cruise_is_that_of_one_quintic_and_shorter_ones_are_quintics(vel: list[float]) -> None:
+    def way_of(distance_m: float) -> QuinticTrajectory:
+        return quintic_to(np.zeros(3), np.array(vel), np.array([distance_m, 0.0, 0.0]), 2.0, accel_m_s2=1.2)
+
+    least_m, most_m = 1.0, 100.0
+    while most_m - least_m > 1e-7:
+        middle_m = 0.5 * (least_m + most_m)
+        least_m, most_m = (least_m, middle_m) if way_of(middle_m).cruise_s > 0.0 else (middle_m, most_m)
+    if not any(vel):  # 3.08 v / a at 1 / 1.875 of v
+        assert most_m == pytest.approx(1.643 * 2.0**2 / 1.2, rel=1e-3)
+    t_s = np.linspace(0.0, way_of(most_m).travel_s, 500)
+    for shorter, longer in zip(way_of(least_m).sample(t_s), way_of(most_m).sample(t_s), strict=True):
+        np.testing.assert_allclose(shorter, longer, atol=1e-5)
+    assert way_of(least_m).travel_s == max(1.875 * least_m / 2.0, way_of(least_m).shed_s or 0.0)
+
+
+@pytest.mark.parametrize("speed_m_s", [0.3, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize("towards", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+def test_whichever_way_a_vehicle_flies_first_a_cruise_is_no_faster_nor_harder_than_one_quintic(
+    speed_m_s: float, towards: list[float]
+) -> None:
+    def peaks(trajectory: QuinticTrajectory) -> tuple[float, float]:
+        said, _, accel = derivatives(trajectory)
+        return float(np.linalg.norm(said, axis=1).max()), float(np.linalg.norm(accel, axis=1).max())
+
+    most_m_s2 = 0.0
+    for distance_m in (0.5, 1.5, 3.0, 5.0, 8.0, 12.0, 26.0, 100.0):
+        target = np.array([distance_m, 0.0, 0.0])
+        way = quintic_to(np.zeros(3), speed_m_s * np.array(towards), target, 2.0, accel_m_s2=1.2)
+        alone_s = max(1.875 * distance_m / 2.0, np.sqrt(5.77 * distance_m / 1.2), way.shed_s or 0.0)
+        most_m_s2 = max(most_m_s2, peaks(replace(way, travel_s=alone_s, cruise_s=0.0))[1])
+        if way.cruise_s > 0.0:
+            fastest_m_s, hardest_m_s2 = peaks(way)
+            assert fastest_m_s <= max(2.0, speed_m_s) + 1e-6
+            assert hardest_m_s2 <= max(1.2, most_m_s2) + 1e-3
+    assert way.cruise_s > 0.0
+
+
+def test_who_share_a_goal_speed_up_and_brake_together_on_a_long_way() -> None:
+    """In proportion to each other they stay as far apart as they begin and end; the farther one brakes no later."""
+    starts = np.array([[0.0, 0.0, -1.0], [0.0, 2.0, -1.0], [-14.0, 0.0, -1.0]])
+    params = MissionParams.model_validate({"kind": "goto", "goto": {"goals_ned_m": [[60.0, 0.0, -1.0]]}})
+    t_s = np.linspace(0.0, 80.0, 2000)
+    flown = [MissionReference(params, starts, agent, apart_m=0.9).sample(t_s)[0] for agent in range(3)]
+    shares = [np.linalg.norm(pos - pos[0], axis=1) / np.linalg.norm(pos[-1] - pos[0]) for pos in flown]
+    assert np.ptp(shares, axis=0)[t_s < 10.0].max() < 0.02
+    apart_m = min(np.linalg.norm(flown[i] - flown[j], axis=1).min() for i, j in ((0, 1), (0, 2), (1, 2)))
+    assert apart_m >= 0.9 - 0.05
 
 
 @pytest.mark.parametrize("speed_m_s", [0.0, 0.3, 2.5, 10.0])

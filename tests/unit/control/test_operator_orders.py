@@ -360,7 +360,7 @@ def test_what_a_goto_comes_to_is_said_and_of_other_orders_nothing() -> None:
     flight.ask(GOTO, **POINT)
     assert outcome_of(Order(GOTO, POINT), flight.mission) == "flies to 3, -2, -4: 2.0 m, 3 s"
     flight.ask(GOTO, **POINT | {"north_m": 403.0}, speed_m_s=1.0)
-    assert outcome_of(Order(GOTO, POINT), flight.mission) == "flies to 403, -2, -4: 400 m, 13 min"
+    assert outcome_of(Order(GOTO, POINT), flight.mission) == "flies to 403, -2, -4: 400 m, 7 min"
     assert outcome_of(Order("hold"), flight.mission) == ""
 
 

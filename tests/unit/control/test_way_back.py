@@ -79,3 +79,19 @@ def test_a_way_to_a_reference_that_flies_away_ends() -> None:
         "waypoints": {"speed_m_s": 3.0, "lists": [{"points_ned_m": [START.tolist(), [900.0, 0.0, -2.0]]}]},
     }
     assert way_from((-40.0, 0.0, -2.0), (0.0, 0.0, 0.0), reference_of(line), 10.0).travel_s < 200.0
+
+
+def test_a_way_to_a_place_far_away_takes_as_long_as_a_transit() -> None:
+    hover = reference_of({"kind": "hover"})
+    way = way_from((203.0, 0.0, -2.0), (0.0, 0.0, 0.0), hover, 10.0)
+    assert way.travel_s == pytest.approx(100.0 + 2.4, abs=0.1)
+    assert np.linalg.norm(flown(way, hover, 10.0)[2], axis=1).max() <= SPEED_M_S + 1e-6
+
+
+@pytest.mark.parametrize("away_m", [4.0, 9.0, 30.0, 300.0])
+def test_speed_and_acceleration_are_checked_where_a_way_speeds_up_and_brakes(away_m: float) -> None:
+    way = way_from((3.0 + away_m, 0.0, -2.0), (0.0, 0.0, 0.0), reference_of({"kind": "hover"}), 0.0)
+    t_s, speeds_up_s = way.checked_s(), 0.5 * (way.travel_s - way.cruise_s)
+    assert t_s[0] == 0.0 and t_s[-1] == way.travel_s
+    assert (np.diff(t_s) > 0.0).all()
+    assert (np.diff(t_s)[(t_s[1:] <= speeds_up_s) | (t_s[:-1] >= way.travel_s - speeds_up_s)] < 0.25).all()
