@@ -18,7 +18,7 @@ _WAY_POINTS = 300  # of a way that is checked
 TRANSIT_HEIGHT_M = 0.5  # least above the ground, of a point to go to, and as a vehicle stops or turns round
 _LOWER_M = 0.1  # by which one that flies lower than that may sink: it need not brake hard for a swaying
 _HARDER = 8  # decelerations that are tried, from that of transits up, until one keeps above the ground
-_LOW_POINTS = 60  # of a way whose lowest point is looked for
+_LOW_POINTS = 60  # of a way whose lowest point is looked for, and of the part in which its first velocity is shed
 # most deceleration over `brake_m_s2`: 3/4 of it is the peak of a stop, 1.31 that of shedding a velocity
 _OF_STOPS, _OF_SHEDDING = 2.0, 1.15
 
@@ -130,7 +130,7 @@ class Trajectories:
             return quintic_to(pos, vel, target_ned_m, peak_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
 
         def lowest_m(found: QuinticTrajectory) -> float:
-            return float(found.sample(np.linspace(0.0, found.travel_s, _LOW_POINTS))[0][:, 2].max())
+            return float(found.sample(_low_s(found.travel_s, found.shed_s))[0][:, 2].max())
 
         between_m_s2 = self._decelerations_m_s2(vel, _OF_SHEDDING)
         self._begin(self._above_ground(state, between_m_s2, shed, lowest_m, float(target_ned_m[2])), now_us)
@@ -165,7 +165,7 @@ class Trajectories:
             return way_back(mission, mission_t_s, now_us, state, **limits, shed_s=shed_s)
 
         def below_mission_m(found: WayBack) -> float:
-            t_s = np.linspace(0.0, found.travel_s, _LOW_POINTS)
+            t_s = _low_s(found.travel_s, found.shed_s)
             pos, vel = mission.sample(mission_t_s + t_s)
             lowest_m = float(found.sample(t_s, pos, vel)[0][:, 2].max())
             return -math.inf if lowest_m <= pos[:, 2].max() else lowest_m
@@ -227,6 +227,14 @@ def way_home(
     hard_m_s2 = max(accel_m_s2, _OF_SHEDDING * brake_m_s2)
     shed_s = shedding_s(vel_ned_m_s, _gentle_m_s2(vel_ned_m_s, speed_m_s, accel_m_s2, hard_m_s2))
     return quintic_to(pos_ned_m, vel_ned_m_s, home_ned_m, speed_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
+
+
+def _low_s(travel_s: float, shed_s: float | None) -> Array:
+    """Return the times of a way (K,) at which its lowest point is looked for: a long one leads lowest as it begins."""
+    whole_s = np.linspace(0.0, travel_s, _LOW_POINTS)
+    return (
+        whole_s if shed_s is None else np.concatenate([whole_s, np.linspace(0.0, min(shed_s, travel_s), _LOW_POINTS)])
+    )
 
 
 def _gentle_m_s2(vel_ned_m_s: Array, speed_m_s: float, accel_m_s2: float, hard_m_s2: float) -> float:

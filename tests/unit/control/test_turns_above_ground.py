@@ -130,3 +130,15 @@ def test_the_way_home_and_that_into_a_mission_keep_above_the_ground(
     mission = sinking(2.0, 2.0)
     assert way(trajectories(mission), state)[:, 2].max() <= -LEAST_M + 1e-2
     assert way(trajectories(mission, ground_z_m=None), state)[:, 2].max() > -LEAST_M
+
+
+@pytest.mark.parametrize("away_m", [20.0, 300.0, 900.0])
+def test_a_way_keeps_above_the_ground_however_long_it_is(away_m: float) -> None:
+    """Of 900 m, points that are spread over the whole way are 3 s apart, and the first velocity is shed in 5 s."""
+    flown = trajectories(sinking(2.0, 2.0))
+    sinks = builders.vehicle_state(pos_ned_m=np.array([0.0, 0.0, -2.0]), vel_ned_m_s=np.array([0.0, 0.0, 2.0]))
+    flown.go_to(np.array([away_m, 0.0, -3.0]), 0, sinks)
+    assert lowest_m(flown) <= -LEAST_M + 0.02
+    unknown = trajectories(sinking(2.0, 2.0), ground_z_m=None)
+    unknown.go_to(np.array([away_m, 0.0, -3.0]), 0, sinks)
+    assert lowest_m(unknown) > -LEAST_M + 0.3, "where the ground is not known"
