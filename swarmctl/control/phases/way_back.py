@@ -56,11 +56,9 @@ class WayBack:
         ramps_s = self.travel_s - self.cruise_s
         if self.cruise_s <= ramps_s:
             return np.linspace(0.0, self.travel_s, _POINTS)
-        ramp_s, cruise_s = (
-            np.linspace(0.0, 0.5 * ramps_s, _POINTS // 2),
-            np.linspace(0.0, self.cruise_s, _CRUISE_POINTS),
-        )
-        return np.concatenate([ramp_s, 0.5 * ramps_s + cruise_s[1:-1], self.travel_s - ramp_s[::-1]])
+        ramp_s = np.linspace(0.0, 0.5 * ramps_s, _POINTS // 2)
+        cruise_s = 0.5 * ramps_s + np.linspace(0.0, self.cruise_s, _CRUISE_POINTS)[1:-1]
+        return np.concatenate([ramp_s, cruise_s, self.travel_s - ramp_s[::-1]])
 
     def is_flown(self, t_s: Array, pos_ned_m: Array, vel_ned_m_s: Array, speed_m_s: float, accel_m_s2: float) -> bool:
         """Return whether speed and acceleration stay near what a transit has, beside those of the reference.

@@ -10,7 +10,7 @@ import numpy as np
 from swarmctl.core.types import Array
 
 _PEAK = 1.875  # speed of a quintic from rest, over its mean
-_RAMPS = 3.08  # time, over speed / acceleration, of one from rest that has these peaks: 10 / (1.875 sqrt 3) of them
+_RAMPS = 3.08  # time of one with both given peaks, over speed / acceleration: 10 / sqrt(3) / 1.875, rounded up
 _RAMPS_OF_SHED = 3.0  # its least time over that in which a first velocity is shed: together they else exceed both peaks
 
 
