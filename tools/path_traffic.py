@@ -19,6 +19,7 @@ from pathlib import Path
 
 import swarmctl.kernels  # noqa: F401  # isort: skip  # before numpy, for the same flights everywhere
 import numpy as np
+from numpy.typing import NDArray
 
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.conditions.layouts import nudged
@@ -112,7 +113,9 @@ def _mean_error_m(flight: Lockstep, agent: int) -> float:
     truth = flight.truth.reshape(-1, len(flight.agents))
     rows = flight.logs[agent].ticks
     rows = rows[rows["phase"] == Phase.TRACK]
-    true = [np.interp(rows["t_us"], truth["t_us"][:, 0], truth["pos_ned_m"][:, agent, axis]) for axis in range(3)]
+    t_us: NDArray[np.int64] = truth["t_us"][:, 0]
+    pos_ned_m: NDArray[np.float64] = truth["pos_ned_m"][:, agent]
+    true = [np.interp(rows["t_us"], t_us, pos_ned_m[:, axis]) for axis in range(3)]
     return float(np.linalg.norm(np.stack(true, axis=1) - rows["ref_pos_ned_m"], axis=1).mean())
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
@@ -48,7 +49,9 @@ def errors(*overrides: str) -> Errors:
     ticks, truth = log.ticks, flight.truth
     ticks = ticks[ticks["mission_t_s"] >= STEADY_FROM_S]
     assert len(ticks) >= 400
-    true = [np.interp(ticks["t_us"], truth["t_us"], truth["pos_ned_m"][:, axis]) for axis in range(3)]
+    t_us: NDArray[np.int64] = truth["t_us"]
+    pos_ned_m: NDArray[np.float64] = truth["pos_ned_m"]
+    true = [np.interp(ticks["t_us"], t_us, pos_ned_m[:, axis]) for axis in range(3)]
     error = np.stack(true, axis=1) - ticks["ref_pos_ned_m"]
     down = error[:, 2]
     return Errors(float(np.sqrt((error**2).sum(axis=1).mean())), float(down.mean()), float(np.abs(down).max()))

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from sitl.studies.bench.free_ports import free_ports
 from swarmctl.core.recorded.records import TRUTH_COLUMNS
@@ -134,10 +135,15 @@ def least_separation_m(*folders: Path) -> float:
     a, b = (read_parquet(folder / PACKED_TRUTH, TRUTH_COLUMNS) for folder in folders)
     assert (set(a["vehicle"]), set(b["vehicle"])) == ({0}, {1})
     t_us = a["t_us"][(a["t_us"] >= b["t_us"][0]) & (a["t_us"] <= b["t_us"][-1])]
-    of_a, of_b = (
-        np.array([np.interp(t_us, rows["t_us"], rows["pos_ned_m"][:, k]) for k in range(3)]) for rows in (a, b)
-    )
-    return float(np.linalg.norm(of_a - of_b, axis=0).min())
+    apart_m: NDArray[np.float64] = positions_at(t_us, a) - positions_at(t_us, b)
+    return float(np.linalg.norm(apart_m, axis=0).min())
+
+
+def positions_at(t_us: NDArray[np.int64], truth: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return the true position (3, T) of the only vehicle in rows of truth, NED [m]."""
+    times_us: NDArray[np.int64] = truth["t_us"]
+    pos_ned_m: NDArray[np.float64] = truth["pos_ned_m"]
+    return np.array([np.interp(t_us, times_us, pos_ned_m[:, k]) for k in range(3)])
 
 
 def test_two_hosts_fly_one_swarm_that_a_station_commands_and_judges(

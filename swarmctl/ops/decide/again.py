@@ -126,8 +126,10 @@ def decide_again(directory: Path, config: Config, recording: Recording, agent: i
 def compare(was: NDArray[np.void], now: NDArray[np.void], agent: int) -> Decisions:
     """Compare what an agent has decided with what it decides now, ticks (T,) each."""
     tilt_rad = _angle_rad(was["setpoint_q_nb"], now["setpoint_q_nb"])
-    thrust_01 = np.abs(was["setpoint_thrust_01"] - now["setpoint_thrust_01"])
-    one_alone = np.isnan(was["setpoint_thrust_01"]) != np.isnan(now["setpoint_thrust_01"])
+    was_01: NDArray[np.float32] = was["setpoint_thrust_01"]
+    now_01: NDArray[np.float32] = now["setpoint_thrust_01"]
+    thrust_01 = np.abs(was_01 - now_01)
+    one_alone = np.isnan(was_01) != np.isnan(now_01)
     phases, plans = was["phase"] != now["phase"], was["plan_status"] != now["plan_status"]
     differ = phases | plans | one_alone | (tilt_rad > DIFFERS_RAD) | (thrust_01 > DIFFERS_01)
     return Decisions(

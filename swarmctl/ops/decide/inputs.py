@@ -136,9 +136,11 @@ def begins_utc_us(rows: NDArray[np.void]) -> NDArray[np.int64]:
     """Return the UTC (T,) [us] at which ticks have begun: rows of older recordings hold that of their end, and both
     monotonic and UTC time go on alike over a second.
     """
-    late_us = np.pad(rows["utc_us"] - rows["t_us"], _SECOND_TICKS // 2, mode="edge")
+    utc_us: NDArray[np.int64] = rows["utc_us"]
+    t_us: NDArray[np.int64] = rows["t_us"]
+    late_us = np.pad(utc_us - t_us, _SECOND_TICKS // 2, mode="edge")
     least_us = np.lib.stride_tricks.sliding_window_view(late_us, _SECOND_TICKS + 1).min(axis=1)
-    return np.asarray(rows["t_us"] + least_us)
+    return np.asarray(t_us + least_us)
 
 
 def peer_messages(

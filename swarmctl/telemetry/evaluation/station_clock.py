@@ -159,7 +159,9 @@ def by_station_clock(
             continue
         clocked[agent] = rows.copy()
         clocked[agent]["utc_us"] = rows["t_us"] + shift_us
-        ahead_s[agent] = float(np.median(rows["utc_us"] - clocked[agent]["utc_us"])) / 1e6
+        utc_us: NDArray[np.int64] = rows["utc_us"]
+        station_utc_us: NDArray[np.int64] = clocked[agent]["utc_us"]
+        ahead_s[agent] = float(np.median(utc_us - station_utc_us)) / 1e6
     return ClockedTicks(ticks=clocked, ahead_s=ahead_s)
 
 

@@ -145,7 +145,9 @@ def utc_offset_us(ticks: Mapping[int, NDArray[np.void]]) -> float:
     """Return UTC minus monotonic time of the host [us]; 0 when nothing was recorded."""
     for rows in ticks.values():
         if len(rows):
-            return float(np.median(rows["utc_us"] - rows["t_us"]))
+            utc_us: NDArray[np.int64] = rows["utc_us"]
+            t_us: NDArray[np.int64] = rows["t_us"]
+            return float(np.median(utc_us - t_us))
     return 0.0
 
 
@@ -266,11 +268,13 @@ def shared_references(ticks: Mapping[int, NDArray[np.void]]) -> dict[int, list[i
 
 def _apart_01(rows: NDArray[np.void], others: NDArray[np.void]) -> float:
     """Return the fraction of the mission time of both agents in which their references are apart."""
-    times_s, others_s = rows["mission_t_s"], others["mission_t_s"]
+    times_s: NDArray[np.float64] = rows["mission_t_s"]
+    others_s: NDArray[np.float64] = others["mission_t_s"]
+    others_ned_m: NDArray[np.float64] = others["ref_pos_ned_m"]
     both = (times_s >= others_s[0]) & (times_s <= others_s[-1])
     if not both.any():
         return 1.0
-    theirs = [np.interp(times_s[both], others_s, others["ref_pos_ned_m"][:, k]) for k in range(3)]
+    theirs = [np.interp(times_s[both], others_s, others_ned_m[:, k]) for k in range(3)]
     apart_m = np.linalg.norm(rows["ref_pos_ned_m"][both] - np.column_stack(theirs), axis=1)
     return float(np.mean(apart_m > _SAME_M))
 
@@ -279,7 +283,8 @@ def track_error(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) -> 
     """Return the tracking error of one agent at each tick of the mission with known position and reference."""
     during = _is_tracking(rows)
     tracking = rows[during]
-    error_ned_m = true_positions(rows, truth, agent)[during] - tracking["ref_pos_ned_m"]
+    ref_ned_m: NDArray[np.float64] = tracking["ref_pos_ned_m"]
+    error_ned_m = true_positions(rows, truth, agent)[during] - ref_ned_m
     known = np.isfinite(error_ned_m).all(axis=1)
     error_ned_m = error_ned_m[known]
     return TrackError(

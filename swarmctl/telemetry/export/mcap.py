@@ -98,7 +98,9 @@ def _begins_us(run: RunData) -> int:
 
 def _utc_us(ticks: NDArray[np.void], t_us: Any) -> Any:
     """Return the UTC of monotonic times, as ticks (T,) have it: it follows a clock that was set in flight slowly."""
-    ahead_us = np.interp(t_us, ticks["t_us"], ticks["utc_us"] - ticks["t_us"]) if len(ticks) else 0.0
+    utc_us: NDArray[np.int64] = ticks["utc_us"]
+    at_us: NDArray[np.int64] = ticks["t_us"]
+    ahead_us = np.interp(t_us, at_us, utc_us - at_us) if len(ticks) else 0.0
     return t_us + np.rint(ahead_us).astype(np.int64)
 
 

@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from threading import Barrier, Event
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -192,7 +193,8 @@ def test_what_an_older_recording_lacks_is_no_zero(tmp_path: Path) -> None:
 @pytest.mark.parametrize("more", ["<f4", "u1", "<f8"])
 def test_raw_rows_of_another_layout_are_refused(tmp_path: Path, more: str) -> None:
     rows, _ = flight(0, 1, 6.0)
-    other = np.zeros(len(rows), np.dtype([*((name, rows.dtype[name]) for name in rows.dtype.names or ()), ("x", more)]))
+    columns: list[tuple[str, Any]] = [(name, rows.dtype[name]) for name in rows.dtype.names or ()]
+    other = np.zeros(len(rows), np.dtype([*columns, ("x", more)]))
     for name in rows.dtype.names or ():
         other[name] = rows[name]
     other.tofile(tmp_path / "agent-0.ticks")
