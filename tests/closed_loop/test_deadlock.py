@@ -48,6 +48,7 @@ class Flown:
         )
         lockstep = Lockstep(config)
         logs, path = lockstep.logs, []
+        self._second_ticks = round(config.agent.rate_hz)
         t_s, here = -math.inf, starts
         while not t_s >= seconds and not (t_s > 1.0 and np.linalg.norm(here - goals, axis=1).max() < ARRIVED_M):
             lockstep.step()
@@ -65,7 +66,7 @@ class Flown:
     @property
     def moved_m(self) -> float:
         """Return the largest distance of any agent, in the last second, from its final position."""
-        return float(np.linalg.norm(self.pos_ned_m[-50:] - self.pos_ned_m[-1], axis=2).max())
+        return float(np.linalg.norm(self.pos_ned_m[-self._second_ticks :] - self.pos_ned_m[-1], axis=2).max())
 
 
 def corridor() -> str:
@@ -133,7 +134,9 @@ UNDAMPED = "controller.mpc.proximal_xy=0"
 
 
 def ten_to_one_point(*sets: str) -> Flown:
-    flown = Flown(layout_of("same_goal", 8, 10).starts_ned_m, np.zeros((1, 3)), 6.5, *sets)
+    """Fly them at half the rate, as `COARSE`: from four starts they rest within 6 % of the least sum."""
+    starts_ned_m = layout_of("same_goal", 8, 10).starts_ned_m
+    flown = Flown(starts_ned_m, np.zeros((1, 3)), 6.5, "agent.rate_hz=25", *sets)
     assert flown.separation_m > 0.85
     return flown
 
