@@ -58,8 +58,9 @@ class Simulator:
 
     def wait_until_up(self) -> None:
         assert self.process.stdout is not None
-        for _ in self.ports:
-            assert "sysid=" in self.process.stdout.readline()
+        lines = iter(self.process.stdout.readline, "")
+        for _ in self.ports:  # before them it may say that it has found other ports of its own, the second being taken
+            assert any("sysid=" in line for line in lines), "it has ended"
 
     def stop(self) -> None:
         self.process.terminate()
