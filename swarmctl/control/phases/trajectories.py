@@ -11,7 +11,7 @@ import numpy as np
 
 from swarmctl.control.phases.way_back import WayBack, way_back
 from swarmctl.control.reference.mission import MissionReference
-from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to, shedding_s
+from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, shedding_s, transit_to
 from swarmctl.core.types import Array, VehicleState
 
 _WAY_POINTS = 300  # of a way that is checked
@@ -127,7 +127,7 @@ class Trajectories:
 
         def shed(shed_m_s2: float) -> QuinticTrajectory:
             shed_s = shedding_s(vel, shed_m_s2)
-            return quintic_to(pos, vel, target_ned_m, peak_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
+            return transit_to(pos, vel, target_ned_m, peak_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
 
         def lowest_m(found: QuinticTrajectory) -> float:
             return float(found.sample(_low_s(found.travel_s, found.shed_s))[0][:, 2].max())
@@ -226,7 +226,7 @@ def way_home(
     """
     hard_m_s2 = max(accel_m_s2, _OF_SHEDDING * brake_m_s2)
     shed_s = shedding_s(vel_ned_m_s, _gentle_m_s2(vel_ned_m_s, speed_m_s, accel_m_s2, hard_m_s2))
-    return quintic_to(pos_ned_m, vel_ned_m_s, home_ned_m, speed_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
+    return transit_to(pos_ned_m, vel_ned_m_s, home_ned_m, speed_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
 
 
 def _low_s(travel_s: float, shed_s: float | None) -> Array:

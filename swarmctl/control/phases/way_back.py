@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from swarmctl.control.reference.mission import MissionReference
-from swarmctl.control.reference.quintic import bend_to_target, out_and_back, quintic_to, to_target
+from swarmctl.control.reference.quintic import bend_to_target, out_and_back, to_target, transit_to
 from swarmctl.core.types import Array, VehicleState
 
 _POINTS = 60  # of a way whose speed and acceleration are checked, beside those of its cruise
@@ -106,7 +106,7 @@ def way_back(
     """
     pos, vel = mission.sample(np.array([mission_t_s]))
     here, first_m_s = state.pos_ned_m, state.vel_ned_m_s
-    transit = quintic_to(here, first_m_s, pos[0], speed_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
+    transit = transit_to(here, first_m_s, pos[0], speed_m_s, accel_m_s2=accel_m_s2, shed_s=shed_s)
     way = WayBack(
         began_us=now_us,
         from_ned_m=here,

@@ -62,8 +62,7 @@ def _goal_flights(
 ) -> tuple[QuinticTrajectory, ...]:
     """Return the flight of every agent; agents that share a goal arrive together, outer ones a little later.
 
-    A ring of agents that closes before the inner ones have arrived opens only after much pushing. All speed up and
-    brake at the times of the longest of their ways, so that they stay in proportion to each other.
+    A ring of agents that closes before the inner ones have arrived opens only after much pushing.
     """
     agents, starts_ned_m = len(starts), np.array(starts)
     goals = np.array(params.goals_ned_m) if params.goals_ned_m else starts_ned_m
@@ -77,9 +76,8 @@ def _goal_flights(
         for start, goal in zip(starts_ned_m, goals, strict=True)
     ]
     for group in groups:
-        slowest = max((flights[i] for i in group), key=lambda flight: flight.travel_s)
+        slowest_s = max(flights[i].travel_s for i in group)
         from_center_m = np.linalg.norm(goals[group] - goals[group].mean(axis=0), axis=1)
         for i, outward_m in zip(group, from_center_m - from_center_m.min(), strict=True):
-            travel_s = slowest.travel_s + outer_delay_s_m * outward_m
-            flights[i] = replace(flights[i], travel_s=travel_s, cruise_s=slowest.cruise_s)
+            flights[i] = replace(flights[i], travel_s=slowest_s + outer_delay_s_m * outward_m)
     return tuple(flights)
