@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sitl.flight_log import FlightLog
 from sitl.flight_parts import NoParts, OtherParts, OutgoingBus, SentMessage, carry
+from sitl.lockstep_rates import steps_per_tick
 from sitl.world import SitlWorld
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
@@ -34,7 +35,6 @@ from swarmctl.core.json_safe import json_safe
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.recorded.records import TRUTH_DTYPE
 from swarmctl.core.types import Phase
-from swarmctl.errors import ConfigError
 from swarmctl.files import write_each
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
@@ -48,7 +48,6 @@ _SINKS_M_S = 0.1  # of vehicles that land, at least: another one rests, or is fl
 _LANDS_M_S = 0.5  # of autopilots that land, at least
 _TRUTH_EVERY_US = 20_000
 _OBSTACLES_EVERY_US = 1_000_000
-_WHOLE = 1e-6  # by which a number of steps may differ from a whole one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +107,7 @@ class Lockstep:
         self.config = config
         self.clock = SimClock()
         self._physics_us = round(1e6 / config.sitl.physics_hz)
-        self._tick_us = self._physics_us * _steps_per_tick(config)
+        self._tick_us = self._physics_us * steps_per_tick(config)
         latency_us = round(config.sitl.link_latency_ms * 1000)
         self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in everyone]  # (agent's, vehicle's) ends
         self._keys = read_keys(config.mavlink.signing_keys, len(everyone))
@@ -312,20 +311,6 @@ class Lockstep:
         lands = bool(rows) and rows[-1]["phase"][0] == Phase.LAND and truth["vel_ned_m_s"][2] > _SINKS_M_S
         height_m = self.config.sitl.ground_z_m - float(truth["pos_ned_m"][2])
         return height_m / _LANDS_M_S if lands and self.config.sitl.start == "ground" else 0.0
-
-
-def _steps_per_tick(config: Config) -> int:
-    """Return how many steps of the physics a tick of the agents has.
-
-    Raises:
-        ConfigError: it has no whole number of them.
-    """
-    physics_hz, rate_hz = config.sitl.physics_hz, config.agent.rate_hz
-    steps = round(physics_hz / rate_hz)
-    if abs(physics_hz / rate_hz - steps) > _WHOLE:
-        told = f"sitl.physics_hz = {physics_hz:g}: in lockstep a multiple of agent.rate_hz"
-        raise ConfigError(config.name, [f"{told} = {rate_hz:g}; set one to suit the other"])
-    return steps
 
 
 def _is_due(now_us: int, step_us: int, every_us: int) -> bool:

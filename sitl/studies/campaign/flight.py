@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.lockstep import Lockstep
+from sitl.lockstep_rates import steps_per_tick
 from sitl.studies.campaign.collision_monitor import STILL_M, CollisionMonitor
 from sitl.studies.campaign.conditions.disturbances import NONE, disturbed
 from sitl.studies.campaign.conditions.factors import NOISES, PROTECTIONS, UNCOOPERATIVE, wind_settings
@@ -84,6 +85,7 @@ def config_of(cell: Cell, seed: int, layout: Layout, agents: int, *, extra: Sequ
             "separation.allow_small_radius=true",  # until it is widened here
         ],
     )
+    steps_per_tick(config)  # refused before anything flies
     needed_m = config.separation.budget.required_m(noise.accuracy_m, config.drift_m)
     radius_m = max(config.separation.radius_m, math.ceil(needed_m * 100.0) / 100.0)
     separation = config.separation.model_copy(update={"radius_m": radius_m, "allow_small_radius": False})

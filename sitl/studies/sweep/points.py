@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sitl.lockstep_rates import steps_per_tick
 from swarmctl.config import Config, load
 from swarmctl.errors import ConfigError
 
@@ -54,7 +55,9 @@ class Flight:
         Raises:
             ConfigError: a key does not exist, or values don't go together.
         """
-        return load(base, [*fixed, *(f"{key}={value}" for key, value in self.settings), f"seed={self.seed}"])
+        config = load(base, [*fixed, *(f"{key}={value}" for key, value in self.settings), f"seed={self.seed}"])
+        steps_per_tick(config)  # refused before anything flies
+        return config
 
 
 def parse_axes(items: Sequence[str], fixed: Sequence[str] = ()) -> list[Axis]:

@@ -345,6 +345,7 @@ def test_no_cluster_is_refused_in_words() -> None:
         (["--agents", "1"], "needs at least 2"),
         (["--scenario", "maze", "--agents", "60"], "would wait"),
         (["--quick", "--scenario", "maze"], "scenario: leave it out"),
+        (["--set", "agent.rate_hz=30"], "a multiple of agent.rate_hz = 30"),
     ],
 )
 def test_cells_that_cannot_be_flown_are_refused_first(

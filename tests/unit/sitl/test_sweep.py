@@ -230,3 +230,9 @@ def test_a_flight_that_an_error_ends_counts_and_is_flown_again(
     monkeypatch.setattr(FlySweep, "__call__", flies)
     assert run(tmp_path, RADIUS, "--seeds=2") == 0
     assert [row["outcome"] for row in rows_in(tmp_path)] == ["completed"] * 4
+
+
+def test_rates_that_do_not_fly_in_lockstep_are_refused_before_anything_flies() -> None:
+    flights = flights_of(parse_axes(["agent.rate_hz=25,30,50"]), 1, 1)
+    (problem,) = problems_of(flights, None)
+    assert problem.startswith("--set agent.rate_hz=30 --seed 1: sitl.physics_hz = 250: in lockstep a multiple of")
