@@ -44,6 +44,7 @@ from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.recording.file_names import ticks_file
 
 _TAIL_S = 120.0  # time allowed before and after the mission, and beyond what ends by itself
+_LAST_S = 5.0  # time in which one that has landed is done, and heard by its peers
 _SINKS_M_S = 0.1  # of vehicles that land, at least: another one rests, or is flown by a pilot
 _LANDS_M_S = 0.5  # of autopilots that land, at least
 _TRUTH_EVERY_US = 20_000
@@ -283,13 +284,14 @@ class Lockstep:
 
     def run(self, on_step: Callable[[Lockstep], bool | None] | None = None) -> None:
         """Fly until every agent has landed, the time limit is reached, or `on_step` returns True."""
-        limit_us = round((self.config.mission.duration_s + _TAIL_S) * 1e6)
+        limit_us, is_last = round((self.config.mission.duration_s + _TAIL_S) * 1e6), False
         while not self.finished:
             if self.clock.now_us() >= limit_us:
                 left_s = max(self.ends_in_s(), self._others.ends_in_s())
-                if not left_s:
+                if is_last and not left_s:
                     return
-                limit_us = self.clock.now_us() + round((left_s + _TAIL_S) * 1e6)
+                is_last = not left_s
+                limit_us = self.clock.now_us() + round((left_s + _TAIL_S if left_s else _LAST_S) * 1e6)
             self.step()
             if on_step is not None and on_step(self):
                 return

@@ -175,6 +175,6 @@ def test_negative_control_vehicles_that_chase_what_they_were_committed_to_come_t
     """What distances leave for clocks is off, too."""
     monkeypatch.setattr(Trajectory, "spread_m", lambda self, from_utc_us: 0.0)
     monkeypatch.setattr(PeerClocks, "spread_us", lambda self, agent: 0)
-    monkeypatch.setattr(Tube, "update", lambda self, *_: False)
+    monkeypatch.setattr(Tube, "update", lambda self, *_, **__: False)
     monkeypatch.setattr(Commitments, "wait_for", lambda self, *_: None)
     assert blown_farther_than_expected("separation.approach_01=0", too_close_m=0.9).min_separation_m < 0.9
