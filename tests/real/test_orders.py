@@ -35,6 +35,7 @@ width_m = 2.0
 omega_rad_s = 0.5
 """
 TOGETHER_US = 1000
+LONG_M = 60.0
 NEAR_M = 1.0  # true positions are up to 0.6 m off the estimate
 
 
@@ -67,6 +68,29 @@ def test_a_climb_is_held_then_flown_on_and_a_point_is_flown_to(field: Fielder, k
     here.witness.wait(
         lambda: math.dist(place(here)[:2], (north_m, east_m)) < NEAR_M, 20.0, "at the point that it was sent to"
     )
+    landed = launched.verb("land")
+    assert landed.returncode == 0, landed.stderr
+    assert launched.end(END_S) == EXIT_INTERRUPTED, launched.text()
+    here.witness.wait(here.witness.all_rest, GROUND_S, "landed and disarmed")
+
+
+@pytest.mark.parametrize("kind", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
+def test_a_long_goto_takes_as_long_as_its_speed_and_is_not_flown_past(field: Fielder, kind: Kind) -> None:
+    """60 m at 2 m/s were one swing of 56 s; with a cruise they are 32 s, and a few more out of a moving mission."""
+    here = field(PX4, 1) if kind is PX4 else booted(field, 1)
+    launched = here.launch(*((PX4_CONFIG, *LONE_PX4) if kind is PX4 else (ARDUPILOT_CONFIG,)))
+    launched.until_phase("TRACK", 1)
+    from_m, sent_s = place(here)[0], time.monotonic()
+    to_m = round(from_m + LONG_M)
+    sent = launched.verb("goto", "0", f"{to_m},0,-5", "--speed", "2")
+    assert sent.returncode == 0, sent.stderr
+    here.witness.wait(lambda: abs(place(here)[0] - to_m) < NEAR_M, 50.0, "at the point that it was sent to")
+    took_s = time.monotonic() - sent_s
+    time.sleep(RESTED_S)
+    north_m = np.array(here.witness.vehicles[0].pos_ned_m)[:, 0]
+    print(f"{to_m - from_m:.1f} m in {took_s:.1f} s, then {north_m.max() - north_m[-1]:.2f} m past")
+    assert took_s < 45.0
+    assert north_m.max() - north_m[-1] < DRIFT_M
     landed = launched.verb("land")
     assert landed.returncode == 0, landed.stderr
     assert launched.end(END_S) == EXIT_INTERRUPTED, launched.text()
