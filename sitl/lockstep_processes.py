@@ -10,7 +10,6 @@ import signal
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from itertools import pairwise
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
@@ -26,6 +25,7 @@ from sitl.lockstep import Flown, Lockstep
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock
 from swarmctl.errors import StartError, SwarmError
+from swarmctl.ops.processes import even_shares
 from swarmctl.process_lifetime import serve_parent
 
 _STEP, _ENDS_IN, _END = range(3)  # what a process is asked for
@@ -48,7 +48,8 @@ class LockstepProcesses:
     """
 
     def __init__(self, config: Config, directory: Path | None, jobs: int) -> None:
-        own, *others = _shares(config.swarm.agents, jobs)
+        agents = config.swarm.agents
+        own, *others = even_shares(agents, min(agents, jobs))  # the leading one has the fewest
         self._workers: list[_Worker] = []
         try:
             for number, part in enumerate(others, 1):
@@ -225,13 +226,6 @@ def _sendable(error: Exception) -> Exception:
     if isinstance(error, SwarmError):
         return error
     return RuntimeError("".join(traceback.format_exception(error)))
-
-
-def _shares(agents: int, jobs: int) -> list[range]:
-    """Return the agents of each process: as many as in the others or one fewer, the first one's the fewest."""
-    count = max(1, min(agents, jobs))
-    ends = [agents * number // count for number in range(count + 1)]
-    return [range(first, end) for first, end in pairwise(ends)]
 
 
 def _joined(parts: Sequence[Flown]) -> Flown:

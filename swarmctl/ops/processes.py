@@ -133,7 +133,11 @@ def agent_commands(
 
 def _shares(agents: int, most: int) -> list[range]:
     """Return the places of the agents of each process: as few processes as do, with as many agents each as others."""
-    processes = -(-agents // most)
+    return even_shares(agents, -(-agents // most))
+
+
+def even_shares(agents: int, processes: int) -> list[range]:
+    """Return the places of the agents of each of so many processes: as many as in the others, or one fewer."""
     return [range(agents * i // processes, agents * (i + 1) // processes) for i in range(processes)]
 
 

@@ -232,9 +232,9 @@ def way_home(
 def _low_s(travel_s: float, shed_s: float | None) -> Array:
     """Return the times of a way (K,) at which its lowest point is looked for: a long one leads lowest as it begins."""
     whole_s = np.linspace(0.0, travel_s, _LOW_POINTS)
-    return (
-        whole_s if shed_s is None else np.concatenate([whole_s, np.linspace(0.0, min(shed_s, travel_s), _LOW_POINTS)])
-    )
+    if shed_s is None:
+        return whole_s
+    return np.concatenate([whole_s, np.linspace(0.0, min(shed_s, travel_s), _LOW_POINTS)])
 
 
 def _gentle_m_s2(vel_ned_m_s: Array, speed_m_s: float, accel_m_s2: float, hard_m_s2: float) -> float:
